@@ -233,7 +233,6 @@ class Cutter:
             tally.topics.setdefault(note.removeprefix(f"{block.origin}: "), []).append(block.origin)
 
     def _count_time(self, table: Table, steps_s: Array) -> None:
-        """Tally what the clock does."""
         recorded, held, kept = steps_s.T
         stands = (held == 0) & np.isfinite(recorded)
         for name, mask in (("back", held < 0), ("still", stands)):

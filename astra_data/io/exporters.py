@@ -20,8 +20,7 @@ from astra_data.dataset.compare import recordings_of
 from astra_data.dataset.reader import Dataset
 from astra_data.io.hdf5_file import D3RLPY, D4RL, MINARI, ROBOMIMIC
 
-NEEDED = (STATE, ACTION, TERMINATED, TRUNCATED, NEXT_STATE)
-"""Columns that every format needs."""
+NEEDED = (STATE, ACTION, TERMINATED, TRUNCATED, NEXT_STATE)  # columns that every format needs
 VECTORS = (STATE, NEXT_STATE, GOAL, ACTION)
 """Columns that are vectors in every format, (T, size), also those of one value per step."""
 VALID_SHARE = 0.1
@@ -190,8 +189,7 @@ EXPORTERS: dict[str, Callable[[Dataset, Path, Path], None]] = {
     "d4rl": _d4rl,
     "minari": _minari,
     "robomimic": _robomimic,
-}
-"""Each writes a dataset to a new path, which is renamed to `out` afterwards."""
+}  # each writes a dataset to a new path, which is renamed to `out` afterwards
 
 
 def _fields(dataset: Dataset, standard: dict[str, str]) -> dict[str, str]:

@@ -35,28 +35,17 @@ MOST_COMPRESSED = 10_000  # larger than the compression ratio of any filter; bey
 def stored_datasets(h5py: Any, group: Any) -> dict[str, Any]:
     """Map the path of each dataset below `group` to it; links into other files are not followed."""
     found: dict[str, Any] = {}
-
-    def visit(name: str, item: object) -> None:
-        if isinstance(item, h5py.Dataset):
-            found[name] = item
-
-    group.visititems(visit)
+    group.visititems(lambda name, item: found.update({name: item} if isinstance(item, h5py.Dataset) else {}))
     return found
 
 
 def refuse_links(h5py: Any, file: Any, origin: str) -> None:
     """Raise BadInputError if a file has links, which may lead into other files."""
     links: list[str] = []
-
-    def visit(name: str, link: object) -> None:
-        if not isinstance(link, h5py.HardLink):
-            links.append(name)
-
-    file.visititems_links(visit)
+    file.visititems_links(lambda name, link: links.extend([] if isinstance(link, h5py.HardLink) else [name]))
     if links:
-        raise BadInputError(
-            f"{origin}: {', '.join(links[:10])}: expected no links; replace each by a copy of its target"
-        )
+        listed = ", ".join(links[:10])
+        raise BadInputError(f"{origin}: {listed}: expected no links; replace each by a copy of its target")
 
 
 def check_storage(datasets: Mapping[str, Any], origin: str) -> None:

@@ -45,10 +45,8 @@ FORMATS: Mapping[str, ModuleType] = {
 }
 SUFFIXES = {name: getattr(module, "SUFFIXES", ()) for name, module in FORMATS.items()}
 """The endings of the names of each format's files; a Minari dataset is a folder."""
-_NAMED = 50
-"""Files with one and the same fault that are named."""
-_LISTED = 8
-"""Files, fields, and lines on rates, that are listed."""
+_NAMED = 50  # files with one and the same fault that are named
+_LISTED = 8  # files, fields, and lines on rates, that are listed
 
 
 @dataclass(frozen=True)
@@ -63,10 +61,8 @@ class ImportReport:
     unused: tuple[str, ...] = ()
     """The files of which no episode was made; `unread` are those of other endings than the format's."""
     unread: tuple[str, ...] = ()
-    left_out: tuple[str, ...] = ()
-    """What is wrong with each file that was left out."""
-    taken: str = ""
-    """Which fields became which columns, where no mapping says so."""
+    left_out: tuple[str, ...] = ()  # what is wrong with each file that was left out
+    taken: str = ""  # which fields became which columns, where no mapping says so
 
     def __str__(self) -> str:
         tally = self.tally

@@ -34,8 +34,7 @@ class McapFile:
 
     def __init__(self, source: Source, topics: Collection[str]) -> None:
         """Look at both ends of the file, and read its index if it has one."""
-        self.is_cut = False
-        """Whether messages may be missing at its end; known once it was read."""
+        self.is_cut = False  # whether messages may be missing at its end; known once it was read
         self.streams: dict[str, Callable[[Any], list[str]]] = {}
         """Topic to what gives the names under which one of its messages is yielded, by default its own."""
         self._decoders: dict[int, Callable[[bytes], Any]] = {}
@@ -50,18 +49,16 @@ class McapFile:
     def messages(self) -> Iterator[tuple[str, Any]]:
         """Yield each message with its topic, in the order of the file."""
         records = optional("mcap.records")
-        wanted = {number: channel.topic for number, channel in self._channels.items()}
         for record in self._records():
             if isinstance(record, records.Message):
-                if record.channel_id not in wanted:
+                if record.channel_id not in self._channels:
                     raise BadInputError(f"{self._source}: no channel {record.channel_id}, which has messages")
-                topic = wanted[record.channel_id]
+                topic = self._channels[record.channel_id].topic
                 if topic in self._wanted:
                     for stream in self.streams[topic](record) if topic in self.streams else [topic]:
                         yield stream, record
             elif isinstance(record, records.Channel):
                 self._channels[record.id] = record
-                wanted[record.id] = record.topic
             elif isinstance(record, records.Schema):
                 self._schemas[record.id] = record
 
@@ -75,8 +72,7 @@ class McapFile:
         known = sorted(self.topics)
         if self.is_cut and not known:
             raise BadInputError(f"{self._source} is cut off before its first message ends: leave it out")
-        missing = [f"no topic '{topic}'{did_you_mean(topic, known)}" for topic in self._wanted if topic not in known]
-        if missing:
+        if missing := [f"no topic '{t}'{did_you_mean(t, known)}" for t in self._wanted if t not in known]:
             raise BadInputError(f"{self._source}: {'; '.join(missing)}")
 
     def decoder(self, number: int) -> Callable[[bytes], Any]:
@@ -92,10 +88,8 @@ class McapFile:
         if channel.message_encoding == "json":
             return self._decoders.setdefault(number, json.loads)
         encoding = f"{channel.message_encoding} with {schema.encoding if schema else 'no'} schema"
-        raise BadInputError(
-            f"{self._source}: messages of {channel.topic} are {encoding}, expected json, protobuf, or cdr "
-            "with ros2msg schema"
-        )
+        expected = "expected json, protobuf, or cdr with ros2msg schema"
+        raise BadInputError(f"{self._source}: messages of {channel.topic} are {encoding}, {expected}")
 
     def _open(self) -> None:
         with self._source.open() as stream:

@@ -132,8 +132,7 @@ FOREIGN = {
     (".pkl", ".pickle", ".joblib"): "a pickle, which is code and never run: load it where you trust it, and "
     "numpy.savez its arrays",
     (".xlsx", ".xls", ".ods"): "a spreadsheet: save it as CSV",
-}
-"""Endings of files that are not read, and what they are and what to do."""
+}  # endings of files that are not read, and what they are and what to do
 
 
 def foreign(names: Sequence[str]) -> str:

@@ -30,13 +30,7 @@ _AVERAGED = 20  # messages of a topic over which jitter is averaged; over many m
 
 
 class Resampler:
-    """Holds the last messages of all topics and samples rows from them.
-
-    Attributes:
-        topics: topic to its fields.
-        times: topic to the time of its last message, in ns.
-        silences: topic to how often it ended an episode: it was silent for too long, and others were not.
-    """
+    """Holds the last messages of all topics and samples rows from them."""
 
     def __init__(
         self,
@@ -51,8 +45,8 @@ class Resampler:
         self.topics: dict[str, list[str]] = {}
         for field in mapping.all_fields:
             self.topics.setdefault(of[field], []).append(field)
-        self.times: dict[str, int] = {}
-        self.silences: Counter[str] = Counter()
+        self.times: dict[str, int] = {}  # of the last message of each topic, in ns
+        self.silences: Counter[str] = Counter()  # how often a topic ended an episode, silent for too long alone
         self._repeated: Counter[str] = Counter()
         self._skipped: Counter[str] = Counter()
         self._messages: Counter[str] = Counter()
@@ -151,8 +145,7 @@ class Resampler:
                 return
             if self._row:
                 self._rows += 1
-                repeated = self.topics.keys() - self._fresh
-                self._repeated.update(repeated)
+                self._repeated.update(self.topics.keys() - self._fresh)
             self._fresh.clear()
             yield self._row == 0, self._row == 0 and self._is_back, dict(self._held)
             self._is_back &= self._row > 0
@@ -169,8 +162,7 @@ class Resampler:
             step = self._spacing_ns * max(1, round(self._periods[topic] / self._spacing_ns))
             phase = np.median(moments - time - step * np.arange(len(moments))) % self._spacing_ns
             phases.append(float(phase))
-        phases.sort()
-        gaps = pairwise([*phases, phases[0] + self._spacing_ns])
+        gaps = pairwise([*sorted(phases), min(phases) + self._spacing_ns])
         before, after = max(gaps, key=lambda gap: gap[1] - gap[0])
         return round((before + after) / 2 % self._spacing_ns)
 

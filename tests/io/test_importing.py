@@ -259,6 +259,8 @@ def test_keys_about_times_need_a_time(tmp_path: Path, set_keys: str, told: str) 
         ("rlds/1.0.0/demos.tfrecord-00000-of-00001", r"RLDS \(TensorFlow Datasets\): .*numpy\.savez"),
         ("log.zarr/.zgroup", r"\.zgroup is Zarr: save its arrays"),
         ("log.zarr/zarr.json", r"zarr\.json is Zarr: save its arrays"),
+        ("bag/bag_0.db3", r"bag_0\.db3 is a bag of ROS 2 in SQLite, .*ros2 bag convert -i BAG"),
+        ("log.mcap.zstd", r"log\.mcap\.zstd is compressed: unpack it \(.*unzstd"),
         ("log.pkl", r"log\.pkl is a pickle, which is code and never run"),
     ],
 )

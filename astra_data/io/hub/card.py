@@ -100,7 +100,6 @@ def render_card(dataset: Dataset, notes: Notes, *, source: str | None = None, fi
 
 
 def _loading(dataset: Dataset, source: str | None) -> str:
-    """Return the section on loading with lerobot, with datasets and with astra-data."""
     name, tag = dataset.description["name"], f"data-{dataset.description['version']}"
     place = None if source is None else parse_source(source)[0]
     if isinstance(place, HubStore):

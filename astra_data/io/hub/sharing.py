@@ -28,10 +28,8 @@ from astra_data.io.hub.stores import (
     parse_sums,
 )
 
-MOST_BYTES = 100 * 10**9
-"""Most bytes that are downloaded unless more are asked for; a robot's logs stay far below."""
-MOST_NAMED = 20
-"""Folders in which datasets are looked for, each with a request of its own."""
+MOST_BYTES = 100 * 10**9  # most bytes that are downloaded unless more are asked for; a robot's logs stay far below
+MOST_NAMED = 20  # folders in which datasets are looked for, each with a request of its own
 
 
 def push(
@@ -54,13 +52,6 @@ def push(
 
     Returns:
         the source from which `pull` downloads it, with its version.
-
-    Raises:
-        BadInputError: there is no such dataset, the place holds something else under this version, the
-            Hub rejects the card, or a repository that should be private is public.
-        CorruptDatasetError: the dataset is incomplete or was altered.
-        RecipeError: the notes have faults.
-        SharingError: the place denies access or cannot be reached, or the version in it was altered.
 
     Example:
         >>> from astra_data import push
@@ -100,7 +91,6 @@ def push(
 
 
 def _refuse_change(there: RemoteFolder, local: Dataset) -> None:
-    """Compare a version that was shared with ours: its sums, and its files."""
     ours = parse_sums(make_sums(local.root), str(local.root))
     listed = parse_sums(there.read_text(SUMS_PATH), there.name)
     if others := sorted(path for path in ours.keys() | listed if ours.get(path) != listed.get(path)):
@@ -135,12 +125,6 @@ def pull(
         version: such as "1.2.0", by default the newest.
         max_bytes: the most bytes of all its files; a larger dataset is refused before it is downloaded.
         progress: called with the fraction done.
-
-    Raises:
-        BadInputError: the source has no such version or is a folder of datasets, or `out` holds something
-            else.
-        CorruptDatasetError: `out` holds this dataset, altered.
-        SharingError: the source cannot be reached, denies access, is too large, or is not a valid dataset.
 
     Example:
         >>> from pathlib import Path

@@ -23,8 +23,7 @@ if TYPE_CHECKING:
 KIND = "dataset"
 TEXT_BYTES = 2**26
 """Most bytes of a description or of SHA256SUMS; some hundred thousand recordings or files fit into it."""
-BLOCK_BYTES = 2**24
-"""Bytes per request."""
+BLOCK_BYTES = 2**24  # bytes per request
 EXTRAS = {"s3": "s3", "s3a": "s3", "gs": "gcs", "gcs": "gcs"}
 """Protocol → the extra of this package that is needed for it."""
 
@@ -34,8 +33,7 @@ _PATH = re.compile(
     rf"(data|meta/episodes)/{_NUMBERED}"
     r"|meta/(info\.json|stats\.json|tasks\.parquet)"
     r"|meta/astra/[a-z_]+\.(json|parquet|safetensors)"
-)
-"""Paths of the files of a dataset, by the names of the format; none of them leads out of its folder."""
+)  # paths of the files of a dataset, by the names of the format; none of them leads out of its folder
 _LINE = re.compile(r"([0-9a-f]{64}) [ *](.+)")
 
 _WORD = r"[A-Za-z0-9][A-Za-z0-9._-]*"
@@ -111,11 +109,9 @@ def is_address(data: str | Path) -> bool:
 class RemoteFolder:
     """The files of one version, wherever they are; of what a stranger put there, only plain files are read."""
 
-    filesystem: Any
-    """Of fsspec."""
+    filesystem: Any  # of fsspec
     path: str
-    name: str
-    """Of the version, for messages."""
+    name: str  # of the version, for messages
 
     def facts(self, path: str) -> dict[str, Any]:
         """Return what the file system knows of a file, such as its "size"; empty without one; refuse links, pipes."""

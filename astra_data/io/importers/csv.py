@@ -158,7 +158,6 @@ def _joined(source: Source, mapping: ImportMapping) -> Iterator[Block]:
 
 
 def _plain(fields: Iterable[str]) -> list[str]:
-    """Return the names of fields within their files."""
     return [field.partition(":")[2] for field in fields if ":" in field]
 
 

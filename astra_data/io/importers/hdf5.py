@@ -17,8 +17,7 @@ from astra_data.io.mapping import ImportMapping
 from astra_data.io.recording import Block, Source, natural, row_count
 
 SUFFIXES = (".h5", ".hdf5", ".mat")
-_COMMANDS = re.compile(r"(?<![a-z])actions?(?![a-z])")
-"""Observations that are, or were, commands."""
+_COMMANDS = re.compile(r"(?<![a-z])actions?(?![a-z])")  # observations that are, or were, commands
 
 
 def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
@@ -32,7 +31,6 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
 def _blocks(
     source: Source, mapping: ImportMapping, origin: str, datasets: dict[str, Any], attributes: dict[str, Any]
 ) -> Iterator[Block]:
-    """Yield the rows of an episode, or of a file."""
     if mapping.episodes is None:
         _refuse_groups(datasets, mapping, origin)
     order = slice(None, None, -1 if mapping.transposed else 1)
@@ -56,7 +54,6 @@ def _blocks(
 
 @contextmanager
 def _opened(source: Source) -> Iterator[tuple[Any, Any]]:
-    """Open a file; yield h5py and it."""
     with source.open() as stream:
         if stream.read(10) == b"MATLAB 5.0":
             raise BadInputError(

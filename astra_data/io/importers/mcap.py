@@ -31,18 +31,14 @@ _log = logging.getLogger(__name__)
 
 
 class MessageField:
-    """What a field takes of each message: `/topic:path.in.message`, or `/topic:path.in.message[name]`.
-
-    Attributes:
-        wanted: the name of the value in a list with names beside it; "" where it is no such one.
-    """
+    """What a field takes of each message: `/topic:path.in.message`, or `/topic:path.in.message[name]`."""
 
     def __init__(self, name: str) -> None:
         self.name = name
         self.topic, _, path = name.partition(":")
         named = re.fullmatch(r"(.+?)\[(.+)\]", path)
         self._keys = (named[1] if named else path).split(".")
-        self.wanted = named[2] if named else ""
+        self.wanted = named[2] if named else ""  # of the names beside a list
         self._names: list[str] | None = None
 
     def names_in(self, content: Any) -> list[str]:
@@ -115,14 +111,16 @@ def check(source: Source, mapping: ImportMapping) -> None:
 def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     """Yield rows at the rate `mapping.fps`."""
     _check_mapping(mapping, str(source))
-    fields = _fields(mapping)
-    file = McapFile(source, fields.keys())
-    fields = _by_publisher(file, fields)
+    by_topic: dict[str, list[MessageField]] = {}
+    for each in map(MessageField, mapping.all_fields):
+        by_topic.setdefault(each.topic, []).append(each)
+    file = McapFile(source, by_topic.keys())
+    fields = _by_publisher(file, by_topic)
     gaps_s = [mapping.split.gap_s or 0, *(column.gap_s or 0 for column in mapping.columns.values())]
     timeline = Timeline(file, gaps_s[0], max(gaps_s))
     topic_of = {field.name: topic for topic, each in fields.items() for field in each}
     resampler = Resampler(mapping, str(source), timeline.moments, topic_of)
-    known = sorted(file.topics - {field.topic for each in fields.values() for field in each})
+    known = sorted(file.topics - by_topic.keys())
     rows: dict[str, list[Message]] = {topic: [] for topic in fields}
     first = count = 0
     is_back = False
@@ -144,20 +142,8 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
         yield replace(block, torn=file.is_cut, notes=resampler.unevenness())
 
 
-def _fields(mapping: ImportMapping) -> dict[str, list[MessageField]]:
-    """Return the fields of each topic."""
-    fields: dict[str, list[MessageField]] = {}
-    for name in mapping.all_fields:
-        of_message = MessageField(name)
-        fields.setdefault(of_message.topic, []).append(of_message)
-    return fields
-
-
 def _by_publisher(file: McapFile, fields: dict[str, list[MessageField]]) -> dict[str, list[MessageField]]:
-    """Treat what several publishers send to one topic, each its own joints, as topics of their own.
-
-    They are called by the topic and the joints. Returns the fields of each.
-    """
+    """Treat what several publishers send to one topic, each its own joints, as topics of their own, named by both."""
     named = {topic for topic, each in fields.items() if any(field.wanted for field in each)}
     sent: dict[str, set[frozenset[str]]] = {topic: set() for topic in named}
     for topic, message in file.messages() if named else ():
@@ -184,7 +170,6 @@ def _sent(file: McapFile, fields: Sequence[MessageField], message: Any) -> froze
 
 
 def _streams(file: McapFile, fields: Sequence[MessageField], of: dict[str, str], message: Any) -> list[str]:
-    """Return as what topics a message counts."""
     return sorted({of[name] for name in _sent(file, fields, message)})
 
 
@@ -194,10 +179,16 @@ def _messages(
     """Yield messages as a `Resampler` takes them."""
     sizes: dict[str, tuple[int, ...]] = {}
     for topic, time, log_time, content, is_back in timeline.messages():
-        values = _values(content, fields[topic], f"{source} at {log_time} ns")
+        values, faults = dict[str, Array](), list[str]()
+        for each in fields[topic]:
+            try:
+                values[each.name] = each.value(content)
+            except BadInputError as error:
+                faults.append(str(error))
         changed = [name for name, v in values.items() if sizes.setdefault(name, v.shape) != v.shape]
-        if changed:
-            raise BadInputError(f"{source} at {log_time} ns: {', '.join(changed)} changes in size")
+        faults += [f"{', '.join(changed)} changes in size"] if changed else []
+        if faults:
+            raise BadInputError(f"{source} at {log_time} ns: {'; '.join(faults)}")
         yield topic, time, (log_time, values), is_back
 
 
@@ -216,11 +207,8 @@ def _block(
 
 
 def _check_mapping(mapping: ImportMapping, origin: str) -> None:
-    faults = [
-        f"field '{name}', expected '/topic:path.in.message'"
-        for name in mapping.all_fields
-        if not all(name.partition(":"))
-    ]
+    odd = [name for name in mapping.all_fields if not all(name.partition(":"))]
+    faults = [f"field '{name}', expected '/topic:path.in.message'" for name in odd]
     if mapping.split.gap_s is None:
         faults.append("split.gap_s is missing: the longest time for which a topic's last value is held")
     if mapping.time is not None:
@@ -231,20 +219,7 @@ def _check_mapping(mapping: ImportMapping, origin: str) -> None:
         raise BadInputError(f"{origin}: {'; '.join(faults)}")
 
 
-def _values(content: Any, fields: Sequence[MessageField], origin: str) -> Mapping[str, Array]:
-    values, faults = {}, []
-    for each in fields:
-        try:
-            values[each.name] = each.value(content)
-        except BadInputError as error:
-            faults.append(str(error))
-    if faults:
-        raise BadInputError(f"{origin}: {'; '.join(faults)}")
-    return values
-
-
 def _part(value: Any, key: str) -> Any:
-    """Return part `key` of a message, `_MISSING` where there is none."""
     if isinstance(value, Mapping):
         return value.get(key, _MISSING)
     if key.isdecimal():
