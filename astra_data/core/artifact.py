@@ -31,10 +31,9 @@ def finished_folder(
 ) -> Iterator[Path]:
     """Yield a working folder that becomes `out` when the block succeeds, without checkpoints of trainings.
 
-    After a failure the working folder, `.<name>.partial` beside `out`, stays if it holds more than the settings:
-    the next call yields it again, so that training can resume from its last checkpoint. With `replace` it begins
-    empty instead; the older `out` is kept as `.<name>.old` until the new one is in its place. `config` is written
-    to `config.json`, and a folder that was begun with another is refused; `made_from` goes into the manifest.
+    After a failure `.<name>.partial` stays if it holds more than the settings, and the next call yields it again: so
+    trainings resume. With `replace` it begins empty; the older `out` is `.<name>.old` until then. A folder that was
+    begun with another `config` is refused; `made_from` goes into the manifest.
     """
     partial, old = (out.parent / f".{out.name}.{state}" for state in ("partial", "old"))
     settings = partial / _SETTINGS

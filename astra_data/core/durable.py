@@ -1,7 +1,6 @@
 """Files and folders that are whole or absent, also after a kill or a power failure.
 
-While one is written, it is in a hidden folder beside its place, `.<name>.tmp-<process>`, which the process
-holds by a lock. What killed processes left is removed by the next one with the same target, or by `clean`.
+While one is written, it is in a locked hidden folder beside its place; what killed processes left is swept later.
 """
 
 import errno
@@ -170,10 +169,7 @@ def write_file(path: Path, content: str | bytes) -> None:
 
 @contextmanager
 def hidden_folder(target: Path) -> Iterator[Path]:
-    """Yield an empty hidden folder beside `target`, which is locked, and removed when the block ends.
-
-    If the block fails, folders made for `target` go, too. After a kill it stays until the next call.
-    """
+    """Yield an empty hidden folder beside `target`, locked, and removed with those made for it when the block ends."""
     with writing(target), folder_for(target), ExitStack() as stack:
         sweep(target)
         for folder in _hidden_names(target):
@@ -243,10 +239,7 @@ def sweep(target: Path) -> None:
 
 
 def clean(folder: Path) -> list[tuple[Path, str]]:
-    """Remove what killed processes left below `folder`; return each path and whether it is removed, in use or kept.
-
-    What a live process writes is in use; what the command that was killed goes on with is kept.
-    """
+    """Remove what killed processes left below `folder`; return each path and whether it is removed, in use or kept."""
     found = []
     for parent, folders, files in os.walk(folder):
         for name in sorted((*folders, *files)):

@@ -23,10 +23,7 @@ def fresh_seed() -> int:
 
 
 def held_out_episodes(episodes: int, share: float, seed: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Draw a `share` of so many episodes to hold out, at least one if it is not 0, the same in every stage.
-
-    Return the numbers of the others and of those, both in random order.
-    """
+    """Draw a `share` of so many episodes to hold out, the same in every stage; return the others' numbers and those."""
     order = generator(seed, "held-out episodes").permutation(episodes)
     count = max(1, round(share * episodes)) if share else 0
     return order[count:], order[:count]

@@ -1,7 +1,4 @@
-"""What a roboticist should know of her logs before she grounds a simulator with them, though they are whole.
-
-How episodes end, which commands were given, the rate, and findings; `doctor` is for datasets that are broken.
-"""
+"""What to know of whole logs before a simulator is grounded with them: ends, commands, the rate, and findings."""
 
 import math
 import re
@@ -145,9 +142,7 @@ class Clock:
     def rates(self) -> tuple[float, int, float, float]:
         """Return period in s, number of gaps, their share of the steps, and jitter in periods; 0 without a rate.
 
-        The period is the mean of the `INNER` share of steps around the median; by the jitter, 5 % of the steps
-        are off at least, gaps aside. Time goes on in most steps, or there is no rate: float32 cannot hold the
-        seconds since 1970, for one.
+        The period is the mean of the `INNER` share of steps around the median; 5 % of the steps are off by the jitter.
         """
         every = np.concatenate([*self.steps_s, np.zeros(0)])
         steps_s = np.sort(every[every > 0])
@@ -306,10 +301,7 @@ def edge_shares(actions: Array) -> Floats:
 
 
 def commands(column: Column, actions: Array, starts: Ints, fps: int) -> tuple[str, list[Finding]]:
-    """Say how long the commands (N, A) are held, how often they are at the edge of their range, and which too often.
-
-    Episodes begin at the rows `starts` (E,).
-    """
+    """Say how long commands (N, A) of episodes from rows `starts` (E,) are held, how often at an edge, too often."""
     names, shares = labels(column), edge_shares(actions)
     held = np.sort(np.concatenate([held_steps(part) for part in np.split(actions, starts[1:])]))
     count = np.arange(1, len(held) + 1)
@@ -328,10 +320,7 @@ def commands(column: Column, actions: Array, starts: Ints, fps: int) -> tuple[st
 
 
 def held_steps(actions: Array) -> Ints:
-    """Return the lengths of the runs of equal rows in `actions` (T, A), without one that the end cuts off.
-
-    A single run is returned though it is cut off.
-    """
+    """Return the lengths of the runs of equal rows in `actions` (T, A), without one of many that the end cuts off."""
     changes = np.flatnonzero((actions[1:] != actions[:-1]).any(axis=1)) + 1
     return np.diff(np.concatenate([[0], changes if len(changes) else [len(actions)]]))
 
@@ -407,10 +396,7 @@ def duplicates(digests: Mapping[str, NDArray[np.uint64]], uids: Sequence[int], c
 def endings(
     uids: Sequence[int], lengths: Ints, terminated: Bools | None, successes: Sequence[bool | None] | None
 ) -> tuple[str, list[Finding]]:
-    """Count the ways in which episodes end; tell whether none goes on after its first step, and of few failures.
-
-    The episodes are of `lengths` (E,), end as `terminated` (E,) and in success, as far as that is known.
-    """
+    """Count the ways in which episodes end; tell whether none goes on after its first step, and of few failures."""
     ended: Bools = np.zeros(len(uids), bool) if terminated is None else terminated
     known = successes or [None] * len(uids)
     succeeded = np.array([success is True for success in known])

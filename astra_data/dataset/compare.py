@@ -105,10 +105,7 @@ def _fingerprints(dataset: Dataset, names: Sequence[str]) -> dict[int, list[obje
 
 
 def lineage(dataset: Dataset) -> Ancestors:
-    """Return `dataset` and all its ancestors, looked up in `versions.home()`, beside it, and in its run.
-
-    An ancestor is found where name, version and content hash are those that its descendant lists.
-    """
+    """Return `dataset` and its ancestors, by name, version and hash, at home, beside it, and in its run."""
     root = dataset.root.resolve()
 
     @cache

@@ -117,10 +117,7 @@ def _parsed(root: Path, description: dict[str, Any]) -> Contents:
 def read_values(
     contents: Contents, columns: Sequence[Column], episodes: Ints
 ) -> Iterator[tuple[dict[str, Array], Ints]]:
-    """Yield `columns` of `episodes`, ascending indices, in blocks of whole episodes, and the indices of each.
-
-    Row groups of our files are whole episodes; files that another tool rewrote may have any.
-    """
+    """Yield `columns` of `episodes`, ascending indices, in blocks of whole episodes, and the indices of each."""
     if not columns:
         return
     if contents.recorded is not None:

@@ -40,12 +40,7 @@ def identity_of(description: Mapping[str, Any]) -> dict[str, str]:
 
 
 def complete_description(description: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the contents of meta/astra/dataset.json, without the content hash.
-
-    Args:
-        description: "name" and "stage", and optionally "version" (by default 1.0.0), "parents" (see
-            `Dataset.identity`), "config", "seeds", "environment" and "simulator" (ids with parameters).
-    """
+    """Return the contents of meta/astra/dataset.json, without the content hash; a `description` has name and stage."""
     full = _DEFAULTS | dict(description)
     faults = [f"unknown key {key!r}, expected {', '.join(_DEFAULTS)}" for key in full.keys() - _DEFAULTS]
     faults += _faults(full)
@@ -113,11 +108,7 @@ def changed_values(
 
 
 def permutation(uids: Iterable[int], seed: int) -> list[int]:
-    """Return `uids` in a random order whose prefixes are the nested subsets.
-
-    The sort key of a uid depends on (seed, uid) alone: in all datasets that derive from the same episodes
-    they come in the same order, whichever were added or removed.
-    """
+    """Return `uids` in a random order, by seed and uid alone, whose prefixes are the nested subsets."""
     return sorted(uids, key=lambda uid: hashlib.sha256(f"{seed} {uid}".encode()).digest())
 
 

@@ -1,8 +1,4 @@
-"""The LeRobot v3.0 format: the constants and rules that lerobot 0.6.1 keeps in code.
-
-They are repeated here because importing lerobot costs seconds and hundreds of megabytes; a test compares
-them with the installed lerobot.
-"""
+"""The LeRobot v3.0 format: the rules that lerobot 0.6.1 keeps in code, whose import is slow; a test compares them."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -65,13 +61,7 @@ def stored_columns(columns: Sequence[Column]) -> list[Column]:
 
 
 def reserved_values(steps: int, *, uid: int, episode: int, start: int, fps: float) -> dict[str, Array]:
-    """Return the uid and LeRobot's own columns of an episode of `steps`, (T,) each, in the file's order.
-
-    `start` is the index of its first step in the dataset.
-
-    Returns:
-        ints, and timestamps in s as float64.
-    """
+    """Return uid and LeRobot's own columns of an episode of `steps` from index `start`, (T,) each, in file order."""
     frames = np.arange(steps)
     return {
         EPISODE_UID: np.full(steps, uid),

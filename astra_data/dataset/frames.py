@@ -26,11 +26,9 @@ Batch = dict[str, Tensor]  # column name to (B, ...)
 
 
 class Order:
-    """Indices of `count` samples, batch by batch, reshuffled each epoch.
+    """Indices (B,) of `count` samples, batch by batch, reshuffled each epoch, by (seed, epoch) alone.
 
-    An epoch's order depends on (seed, epoch) alone. Iterating yields the batches (B,) that are left of the
-    current epoch; the next iteration continues from there, with `batch` of `epoch`. An `Order` also serves a
-    `DataLoader` as batch_sampler; its workers draw a few batches ahead.
+    Iterating goes on from `batch` of `epoch`. It also serves a `DataLoader` as batch_sampler.
     """
 
     def __init__(
@@ -78,11 +76,7 @@ class Order:
 
 
 class Samples(data.Dataset[Batch]):
-    """Samples of the same shape, drawn one by one or in batches.
-
-    For `torch.utils.data.DataLoader` pass a `collate_fn` that returns its argument, because whole batches are
-    drawn at once; `batches` is faster.
-    """
+    """Samples of one shape, drawn one by one or in batches; a `DataLoader` needs a `collate_fn` of no effect."""
 
     def __init__(self, first: Tensor, gather: Callable[[Tensor], Batch], device: torch.device) -> None:
         # Samples begin at rows `first` (M,), and `gather` reads those at rows (B,).
@@ -263,11 +257,7 @@ def take(values: Tensor, rows: Tensor) -> Tensor:
 
 
 def mapped_columns(dataset: Dataset, names: Sequence[str], cache: Path) -> dict[str, Array]:
-    """Memory-map whole columns, (N, size) or (N,), from raw files in `cache`; missing files are written.
-
-    The files are <cache>/<content hash>/<column>/values.npy. Changes of the arrays stay in this process. One
-    process at a time writes a dataset's files; the others wait.
-    """
+    """Memory-map whole columns, (N, size) or (N,), from raw files in `cache`; one process writes missing ones."""
     parent = cache / dataset.content_hash
     parent.mkdir(parents=True, exist_ok=True)
     with held(parent, wait=True):

@@ -1,8 +1,4 @@
-"""Datasets that LeRobot recorded or edited itself, read as ours.
-
-They have none of our metadata, and mostly no next states. The next state of a step is then the state of the
-following row; the last row of an episode has none and is left out, as are cameras and all else but numbers.
-"""
+"""Datasets that LeRobot recorded or edited itself, read as ours; next states are those of the rows that follow."""
 
 import logging
 from collections.abc import Mapping, Sequence

@@ -43,8 +43,8 @@ class Rows:
     def values(self, specs: Iterable[Column], run: Run, episode: int, start: int, uid: int) -> dict[str, Array]:
         """Return the columns `specs` of one episode, (T,) or (T, size).
 
-        An episode that is cut off is truncated. If the row that is left out is terminated, the step before it is,
-        and has its reward and its success or failure; of one that is done, only its success.
+        If the row that is left out is terminated, the step before it is, and has its reward and its success or failure;
+        of one that is done, only its success.
         """
         steps, stored = len(run) - self.dropped, run.columns
         found = {name: values[:steps] for name, values in stored.items()}

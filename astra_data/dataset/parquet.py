@@ -66,11 +66,7 @@ def read_blocks(
     wanted: NDArray[np.bool_] | None = None,
     most_rows: int | None = None,
 ) -> Iterator[pa.Table]:
-    """Yield the columns `names`, by default all, of all files in order; memory stays bounded.
-
-    A block has `most_rows`, by default `BLOCK_ROWS`, rounded up to whole row groups. `wanted` is a mask over
-    all rows of all files; row groups without a wanted row are skipped.
-    """
+    """Yield the columns `names`, by default all, of all files in order, in blocks of whole `wanted` row groups."""
     end, enough = 0, most_rows or BLOCK_ROWS
     for path in paths:
         try:

@@ -50,12 +50,7 @@ def side_by_side[C: (Column, PlainColumn)](columns: Iterable[C]) -> Iterator[tup
 
 
 def global_statistics(columns: Sequence[Column], frames: int, paths: Sequence[Path]) -> dict[str, dict[str, list[Any]]]:
-    """Return meta/stats.json over all `frames`.
-
-    Quantiles are exact, so that at least one index of one column is in memory as a whole. Above
-    `BLOCK_VALUES` frames, memory grows with their number: an index and two float64 copies take 20 bytes per
-    frame of float32 (2 GB for 100 million frames), whatever the number of columns.
-    """
+    """Return meta/stats.json over all `frames`; quantiles are exact: memory grows by up to 20 bytes per frame."""
     indices = [(column, index) for column in columns for index in range(column.size)]
     parts: dict[str, list[NDArray[np.float64]]] = {column.name: [] for column in columns}
     at_once = max(1, BLOCK_VALUES // frames)
@@ -108,10 +103,7 @@ class EpisodeRows:
         self._frames = 0
 
     def append(self, length: int, chunk: int, file: int, statistics: NDArray[np.float64]) -> None:
-        """Append an episode of `length` steps in data file `file` of `chunk`.
-
-        `statistics` are those of all columns side by side, (9, sum of the columns' sizes).
-        """
+        """Append an episode of `length` steps in data file `file` of `chunk`; `statistics` (9, sum of sizes)."""
         self._rows.append((length, chunk, file))
         self._statistics.append(statistics)
         if len(self._rows) == ROWS_AT_ONCE:

@@ -66,10 +66,7 @@ def intact(folder: Path, *names: str) -> list[bytes]:
 
 
 def refuse_far(state: Any, about: dict[str, Any]) -> None:  # noqa: ANN401 - an array
-    """Raise a ValueError for a value of a state (S,) that is far outside what was recorded, if that is known.
-
-    A value that was always zero is not judged, as its range has no width.
-    """
+    """Raise a ValueError for a value of a state (S,) that is far outside what was recorded, if that has a width."""
     if "recorded_least" not in about:
         return
     least, largest = (np.asarray(about[f"recorded_{end}"], float) for end in ("least", "largest"))

@@ -359,10 +359,7 @@ def plain_name(name: str) -> str:
 
 
 def read_numbers(source: Source) -> dict[str, Floats]:
-    """Return the fields (T,) of a CSV file as numbers; true and false are 1 and 0, texts and dates NaN.
-
-    Equal texts of an episode's name have the same number. A last line that is cut off is left out.
-    """
+    """Return the fields (T,) of a CSV file as numbers: equal names have the same, other texts and dates are NaN."""
     file = str(source.path)
     with explained(file, source):
         content, _ = whole_lines(source, file)
@@ -395,10 +392,7 @@ def read_numbers(source: Source) -> dict[str, Floats]:
 
 
 def logs_of(data: Dataset) -> Logs:
-    """Return the episodes of `data` as logs: its states, commands and goals by their own names, and failures.
-
-    Raise BadInputError if a heading is not in rad, or commands beside one are in degrees.
-    """
+    """Return the episodes of `data` as logs: its states, commands and goals by their own names, and failures."""
     columns = data.specs([STATE, ACTION, *([GOAL] if GOAL in data.features else [])])
     roles: tuple[Role, ...] = ("state", "command", "goal")
     fields = [

@@ -173,10 +173,7 @@ class ImportMapping(Config):
         return self
 
     def refuse_timeless(self, file_format: str, origin: str) -> None:
-        """Raise RecipeError where keys of the mapping `origin` say what `time` means, but there is none.
-
-        `gap_s` of a column is for MCAP alone.
-        """
+        """Raise RecipeError where keys of the mapping `origin` say what `time` means, but there is none."""
         of_columns = [f'columns."{name}".gap_s' for name, column in self.columns.items() if column.gap_s]
         if of_columns and file_format != "mcap":
             raise RecipeError(f"{origin}: {', '.join(of_columns)}: only MCAP has it, take split.gap_s")

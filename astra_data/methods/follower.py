@@ -40,11 +40,7 @@ class CarefulFollower:
         return torch.from_numpy(np.stack(fields)).float()
 
     def command(self, position: Tensor, goal: Tensor, fields: Tensor) -> Tensor:
-        """Return velocity commands (B, 2), at `position` (B, 2) for `goal` (B, 2).
-
-        Looks a fifth of a cell around in `fields` (B, height, width) for the cheapest direction out of 32;
-        near the goal it heads straight there.
-        """
+        """Return velocity commands (B, 2), at `position` (B, 2): the cheapest way in `fields`, or to `goal`."""
         angles = torch.arange(32) * (2 * torch.pi / 32)
         directions = torch.stack([angles.cos(), angles.sin()], dim=-1)
         ahead = position[:, None] + 0.2 * self.maze.scale * directions
@@ -61,15 +57,7 @@ class CarefulFollower:
 
 @dataclass(frozen=True)
 class CarefulKicker:
-    """Walk to the point behind the ball, around the ball if near, then up to it, and kick.
-
-    Attributes:
-        clear_m: distance from the ball on the way around it.
-        cone_rad: it walks up to the ball if the turn from there to the goal is less than this.
-        kick_m: distance from which it kicks. brake_m: distance before that over which it slows down.
-        rolls_m_s: balls that seem slower than this count as resting.
-        speed: of the faster axis, in units of commands.
-    """
+    """Walk to the point behind the ball, around the ball if near, then up to it, and kick."""
 
     clear_m: float = 0.3
     cone_rad: float = np.pi / 7

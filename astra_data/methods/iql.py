@@ -1,8 +1,6 @@
-"""IQL on the target's own episodes, and direct transfer fine-tuned by it (Section V, "IQL" and "DT+IQL").
+"""IQL on the target's own episodes, direct transfer fine-tuned by it (Section V), and behavior cloning.
 
-And behavior cloning, IQL without its critics.
-The paper does not say whether the fine-tuning interacts with the target: ours learns from the same recorded
-episodes as every other row. Critics value commands better where they see sines and cosines of the position.
+The paper does not say whether the fine-tuning interacts with the target: ours learns from the same episodes.
 """
 
 import copy
@@ -37,11 +35,7 @@ def _position_features(task: Task) -> PositionFeatures:
 
 
 def learn_from_episodes(training: Training) -> tuple[PolicyFile, dict[str, Any]]:
-    """Learn by IQL from the target's side of the paired episodes, without a simulator.
-
-    Returns:
-        the policy, which starts from `training.initial` if there is one, and the losses every few updates.
-    """
+    """Learn by IQL from the target's side of the paired episodes; return the policy, and losses every few updates."""
     config, episodes = _config(training), training.episodes
     if config.temperature and not episodes.has_rewards:
         raise BadInputError(f"{episodes.reference} has no {REWARD}, from which the policy would be learned")
@@ -77,10 +71,7 @@ def _config(training: Training) -> IqlConfig:
 
 
 def experience_of(task: Task, episodes: PairedEpisodes) -> Experience:
-    """Return the target's side of `episodes` as a policy sees it: φ(s_i), goal, actions, rewards.
-
-    The critics also see sines and cosines of the position, if the task has one.
-    """
+    """Return the target's side of `episodes` as a policy sees it, and sines and cosines of the position for critics."""
     windows = episodes.windows
     features = _position_features(task).to(windows.state.device)
 

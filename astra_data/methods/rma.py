@@ -1,7 +1,4 @@
-"""Rapid motor adaptation: infer the simulator's parameters online (Section V-A; after Kumar et al. 2021).
-
-The parameters and their ranges are those that the paper prints for COMPASS, as the task has them.
-"""
+"""Rapid motor adaptation: infer the simulator's parameters online (Section V-A; after Kumar et al. 2021)."""
 
 from dataclasses import dataclass, replace
 from typing import Any

@@ -23,10 +23,7 @@ _BAR_WIDTH = 20
 
 @contextmanager
 def display(keys: Collection[str], console: Console, then: Callable[[str], object] = lambda _: None) -> Iterator[Watch]:
-    """Show the progress of the items of these `keys` on `console`; call `then` with each that has finished.
-
-    Where lines are too long for the terminal, names and notes are cut off, never bar, share and time left.
-    """
+    """Show the progress of the items of these `keys` on `console`; call `then` with each that has finished."""
     if not console.is_terminal:
         yield _PlainDisplay(keys, console, then)
         return
@@ -61,10 +58,7 @@ class _TimeLeft(ProgressColumn):
 
 
 class TimeEstimate:
-    """The time that a run of items has left, by how long an item of a stage takes.
-
-    An item that runs takes what its share done says; one that waits, what others of its stage take.
-    """
+    """The time that a run of items has left, by how long an item of a stage takes, or what its share done says."""
 
     def __init__(self, keys: Collection[str], clock: Callable[[], float] = time.monotonic) -> None:
         """Take the `keys` of all items; `clock` returns seconds."""

@@ -1,7 +1,4 @@
-"""The environment in which a row of a run is trained, for learners of other libraries; their policies tested.
-
-Gymnasium's "astra_data/Grounded-v0" is made here.
-"""
+"""The environment in which a row is trained, also "astra_data/Grounded-v0", for others' learners; their test."""
 
 from collections.abc import Collection
 from functools import partial
@@ -30,10 +27,7 @@ OPTIONS = ("data_start_share", "episode_steps")
 
 
 def grounded(run: str | Path, row: str, seed: int = 0, percent: int | None = None, **options: Any) -> SingleEnv:
-    """Build the environment of one robot in which a row of a run is trained; "direct_transfer" for the raw one.
-
-    `seed` is that of the data and the grounding; `options` are those of `OPTIONS` not to be as in the recipe.
-    """
+    """Build the environment of one robot in which a row of a run is trained, of `seed`, with `options` of `OPTIONS`."""
     env, _, training = _world(run, settings_of(run), row, seed, percent, num_envs=1, **options)
     return SingleEnv(SeededSimulatorEnv(env), training.simulated_steps)
 
@@ -65,8 +59,7 @@ def evaluate_policy(
 ) -> None:
     """Test a policy of another learner as `evaluate` tests that of a row, and write the figures to `out`.
 
-    It is shown what the row's environment shows; the latent, if the row has one, comes from the row's
-    encoder, in the target from the aligned one. Starts and goals are those of the rows of this seed.
+    It is shown what the row's environment shows; a latent comes from the row's encoder, aligned in the target.
     """
     settings = settings_of(run)
     env, simulation, training = _world(run, settings, row, seed, percent, num_envs=1)

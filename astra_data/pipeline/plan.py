@@ -97,10 +97,7 @@ def plan(
     publish: Path | None = None,
     published: Sequence[Path] = (),
 ) -> tuple[Item, ...]:
-    """Return every artifact of the `recipe` at `path`, each after those it reads, seed after seed.
-
-    The report copies its results to the folder `publish`, if any, and adds to the files `published`.
-    """
+    """Return every artifact of the `recipe` at `path`, each after those it reads, seed after seed, and its report."""
     selection = selection or Selection.of(recipe)
     items = list(_Plan(recipe, folder, selection, device).items())
     keys = tuple(point.key for point in selection.points())
@@ -216,10 +213,7 @@ class _Plan:
         )
 
     def _settings(self, stage: Stage, name: str, given: Mapping[str, Any]) -> dict[str, JsonValue]:
-        """Return what an artifact is made with, as JSON: settings, and digests of the user's code by files.
-
-        Of data in a folder, digests tell; of recorded episodes, any task with the same target is the same.
-        """
+        """Return what an artifact is made with, as JSON: settings, and digests of the user's code by files."""
         recipe, method = self.recipe, base_method(name)
         names = {"task": recipe.task} | {own: given.method for own, given in recipe.own_methods.items()}
         used = {"task": {"task", "simulator"} & given.keys(), method: method in names}

@@ -272,11 +272,7 @@ class Recipe(Config):
 
 
 def with_tables(base: type[Recipe], stages: Iterable[Stage], methods: Iterable[Table]) -> type[Recipe]:
-    """Return the model of recipes with the tables of `stages` and those that `methods` read.
-
-    Further keys: `based_on`, the recipe that provides the settings not given here and the artifacts that do
-    not change; and `sweep`.
-    """
+    """Return the model of recipes with the tables of `stages` and those that `methods` read, `based_on` and `sweep`."""
     fields: dict[str, Any] = {stage.name: _stage_field(stage) for stage in stages if stage.config}
     about = "The recipe of the settings that are not given here, and of the artifacts that do not change."
     fields["based_on"] = (str | None, Field(default=None, description=about))

@@ -34,10 +34,7 @@ def select(
     episodes: int | None = None,
     progress: Progress = silent,
 ) -> choice.Judged:
-    """Judge every trained policy of a run, as the stage `select` does; write `select` in the run's folder.
-
-    A choice that is there is kept if it was made of the same with the same settings, and otherwise set aside.
-    """
+    """Judge every trained policy of a run, as the stage `select` does; a choice made of the same is kept."""
     folder, settings = Path(run), settings_of(run)
     add_all(settings.get("own_methods", {}))
     asked = (settings.get("select") or {}) | only_given(judge=judge, episodes=episodes)
@@ -87,11 +84,7 @@ def choose_by_trials(
     episodes: int | None = None,
     progress: Progress = silent,
 ) -> choice.TrialsFile:
-    """Spend so many episodes in the target on the candidates of a run; write `select/trials.json`.
-
-    Candidates of a round meet the same starts and goals, others than those of `evaluate`. An interrupted call
-    goes on with the next candidate. The best `field` predicted are tried, by default as many as is possible.
-    """
+    """Spend so many episodes in the target on the candidates of a run, `field` at most; write `select/trials.json`."""
     folder, task = Path(run), str(settings_of(run)["task"])
     if not task_named(task).has_target:
         raise BadInputError(f"{folder}: expected a task with a target, got {task}: leave out --trials")

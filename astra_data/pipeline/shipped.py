@@ -120,10 +120,7 @@ def whereabouts(name: str) -> str:
 
 
 def copy_recipe(name: str, folder: Path) -> list[Path]:
-    """Copy a recipe and what it needs to `folder`; return the new files.
-
-    Files that are there with the same bytes stay.
-    """
+    """Copy a recipe and what it needs to `folder`; return the new files. Those that are there, the same, stay."""
     places = {RECIPES / path: folder / path for path in sorted(shipped(name).files)}
     for source, place in places.items():
         if place.exists() and (not place.is_file() or place.read_bytes() != source.read_bytes()):

@@ -67,14 +67,7 @@ def looked_up(own_methods: Mapping[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def with_offered(tables: Mapping[str, Any], keys: Collection[str]) -> dict[str, Any]:
-    """Return the `tables` of a recipe with the methods that installed packages offer among `own_methods`.
-
-    Those are its rows, and its tables, by a name that a package offers; the table of one has its settings.
-
-    Args:
-        tables: as a file or a record has them, not checked yet.
-        keys: of recipes, which are no names of methods.
-    """
+    """Return the `tables` of a recipe with the methods that installed packages offer among `own_methods`."""
     rows, own = tables.get("methods", ()), tables.get("own_methods", {})
     if not isinstance(rows, list | tuple) or not isinstance(own, Mapping):
         return dict(tables)

@@ -79,10 +79,7 @@ def summarize(scores: Sequence[float] | Floats, *, limit: float | None = None, t
 def paired_difference(
     scores: Mapping[int, float], others: Mapping[int, float], *, limit: float | None = None, trials: int = 0
 ) -> Estimate | None:
-    """Return the mean difference on the seeds that both have, with Student's t interval; None where there are none.
-
-    The variance is at least that of drawing the episodes of shares. `limit` and `trials` are as for `summarize`.
-    """
+    """Return the mean difference on the seeds that both have, with Student's t interval; None where there are none."""
     shared = [seed for seed in scores if seed in others]
     if not shared:
         return None

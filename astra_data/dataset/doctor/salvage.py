@@ -40,13 +40,10 @@ def whole_runs(
     *,
     repeated: bool = False,
 ) -> Iterator[tuple[int, plain.Run]]:
-    """Yield the uid and the rows of each intact episode; add to `notes` which were left out, and why.
+    """Yield the uid and the rows of each intact episode, repeated uids if asked; add to `notes` what was left out.
 
-    Without `digests` altered episodes cannot be told from whole ones. With `repeated`, episodes whose uid an
-    earlier one has are yielded, too.
-
-    An episode after rows that are lost is known by its own number and rows, where they agree with
-    meta/episodes or, without that, where both are greater than those that should follow.
+    An episode after rows that are lost is known by its own number and rows, where they agree with meta/episodes or,
+    without that, where both are greater than those that should follow.
     """
     info = plain.read_object(folder / INFO_PATH)
     places, faults = plain.read_places(folder, info if isinstance(info, dict) else {})

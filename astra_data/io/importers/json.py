@@ -1,7 +1,4 @@
-"""JSON: one object of fields with their rows, as the NAO's logs are, or an object a row, in a list or lines.
-
-Fields of objects in objects have the names of both: `pose/x`.
-"""
+"""JSON: one object of fields with their rows, or an object a row, in a list or lines; nested names are `pose/x`."""
 
 import json
 from collections import Counter

@@ -1,8 +1,4 @@
-"""Evaluate: run a policy in the target environment, if the task has one, and in simulators.
-
-These are the one that it was trained in, and two that are the same for all policies, to measure how well each
-predicts the target: the raw simulator, and a grounded one as reference. These two give the task's own reward.
-"""
+"""Evaluate: run a policy in the target, if there is one, where it was trained, and in two simulators for all."""
 
 import json
 from collections.abc import Mapping
@@ -161,10 +157,7 @@ def evaluate(
 
 @dataclass(frozen=True)
 class _Row:
-    """What is tested: `begin` starts it in simulators, `robots` in the target, by the encoder.
-
-    The figures with the encoder `headline` are the row's. `simulators` has the one that it was trained in.
-    """
+    """What is tested: in simulators by `begin`, in the target by `robots` of the encoder, `headline` for figures."""
 
     begin: Begin
     robots: dict[EncoderKind, Begin]

@@ -145,7 +145,6 @@ def pair_steps(
 ) -> tuple[dict[str, Array], float]:
     """Reset `batch`, of B simulators, to φ(s) of N target steps and step it with the actions, B at a time.
 
-    Take states (N, S), actions (N, A) and next states (N, S); `first_step` is the number of the first, for messages.
     Return the `abstract.*` columns (N, X), and the largest difference between φ(s) and the reset simulator.
     """
     abstract = checked_abstraction(pairing, state)

@@ -61,11 +61,7 @@ def report(
     progress: Progress = silent,
     config: ReportConfig = ReportConfig(),
 ) -> None:
-    """Write results.json, .md and .html and the figures to `root`/report.
-
-    They name `command` as their origin, and are added to the files `published`. `publish` is a folder for
-    copies of results.json, .md and the figures, named after the recipe.
-    """
+    """Write results.json, .md and .html and the figures to `root`/report, with copies in `publish` and `published`."""
     from astra_data.reports.figures.catalog import FIGURES, drawn
     from astra_data.reports.figures.style import Scene
     from astra_data.reports.page import sections_of

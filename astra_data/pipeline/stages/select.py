@@ -111,10 +111,7 @@ def digests(of: list[Bench], root: Path) -> dict[str, str]:
 
 
 def select(recipe: Reported, config: SelectConfig = SelectConfig(), *, root: Path, progress: Progress = silent) -> None:
-    """Try every finished policy of a recipe in groundings of other seeds; write `root`/select, ranked.
-
-    Policies of a size are judged by groundings of that size. An interrupted call goes on with the next policy.
-    """
+    """Try every finished policy of a recipe in groundings of other seeds; write `root`/select, ranked, by size."""
     judge = judge_in(recipe, config)
     contests = [bench.finished(root) for bench in benches(recipe, judge)]
     for bench in contests:

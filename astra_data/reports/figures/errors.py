@@ -69,10 +69,7 @@ def reliability_of(results: Results, _: Scene) -> Figure | None:
 
 
 def reliability(parts: Mapping[str, Mapping[str, Floats]]) -> Figure:
-    """Draw observed against predicted rates, by their square roots, above the number of steps at each.
-
-    `parts` is what predicts failures → row → predicted rates, observed rates and numbers of steps, (3, bins).
-    """
+    """Draw observed against predicted rates of `parts`, by their square roots, above the number of steps at each."""
     with style():
         figure = Figure(figsize=(1.9 + 2.7 * len(parts), 4.2), layout="constrained")
         above, below = figure.subplots(
