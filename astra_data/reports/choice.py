@@ -47,7 +47,7 @@ def posterior(prior: float, successes: int, trials: int) -> float:
 
 
 def halve(priors: Sequence[float], trials: int, attempt: Attempt, *, field: int | None = None) -> Halving:
-    """Halve the first `field` candidates, by the posterior mean of their success, in equal rounds, until one remains."""
+    """Halve the first `field` candidates, by their success's posterior mean, in equal rounds, until one is left."""
     left = tuple(range(widest_field(len(priors), trials) if field is None else field))
     spent, successes = [0] * len(priors), [0] * len(priors)
     rounds: list[tuple[tuple[int, ...], int]] = []
