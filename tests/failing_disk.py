@@ -37,12 +37,7 @@ def failing(names: str, at: int, error: BaseException, then: BaseException | Non
 
 
 def _counted(
-    name: str,
-    works: Callable[..., object],
-    calls: list[str],
-    at: int,
-    error: BaseException,
-    then: BaseException | None,
+    name: str, works: Callable[..., object], calls: list[str], at: int, error: BaseException, then: BaseException | None
 ) -> Callable[..., object]:
     def call(*arguments: object, **options: object) -> object:
         calls.append(name)

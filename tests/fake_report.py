@@ -44,12 +44,5 @@ def make(
     config: ReportConfig = CONFIG,
 ) -> Results:
     """Write the report, and return its results."""
-    report(
-        recipe or FakeRecipe(),
-        root=root,
-        command=COMMAND,
-        publish=publish,
-        published=published,
-        config=config,
-    )
+    report(recipe or FakeRecipe(), root=root, command=COMMAND, publish=publish, published=published, config=config)
     return read_results(root / "report/results.json")

@@ -20,11 +20,7 @@ ARM: dict[str, Any] = {
     "next.reward": {"dtype": "float32", "shape": (1,), "names": None},
     "next.done": {"dtype": "bool", "shape": (1,), "names": None},
     "next.success": {"dtype": "bool", "shape": (1,), "names": None},
-    "observation.images.top": {
-        "dtype": "image",
-        "shape": (8, 8, 3),
-        "names": ["height", "width", "channels"],
-    },
+    "observation.images.top": {"dtype": "image", "shape": (8, 8, 3), "names": ["height", "width", "channels"]},
 }
 ANT: dict[str, Any] = {
     "observation.state": {"dtype": "float32", "shape": (29,), "names": None},

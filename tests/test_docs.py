@@ -34,10 +34,7 @@ ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
 PAGES = {
     str(path.relative_to(ROOT)): path.read_text()
-    for path in (
-        *map(ROOT.joinpath, ("README.md", "CONTRIBUTING.md")),
-        *sorted((ROOT / "docs").rglob("*.md")),
-    )
+    for path in (*map(ROOT.joinpath, ("README.md", "CONTRIBUTING.md")), *sorted((ROOT / "docs").rglob("*.md")))
 }
 GROUP = get_command(app)
 assert isinstance(GROUP, TyperGroup)

@@ -81,10 +81,7 @@ def make(place: Path, rows: tuple[str, ...], settings: str) -> Path:
 
 @pytest.mark.parametrize(
     ("rows", "settings"),
-    [
-        (ROWS, f"{PPO}{TABLES}[iql]{IQL}"),
-        (("direct_transfer", "nas", "astra"), SAC),
-    ],
+    [(ROWS, f"{PPO}{TABLES}[iql]{IQL}"), (("direct_transfer", "nas", "astra"), SAC)],
     ids=["ppo", "sac"],
 )
 def test_each_row_learns_there_and_acts_here(tmp_path: Path, rows: tuple[str, ...], settings: str) -> None:

@@ -5,15 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from astra_data.dataset.columns import (
-    ACTION,
-    NEXT_STATE,
-    OUTCOME_COLUMNS,
-    STATE,
-    Array,
-    Column,
-    Episode,
-)
+from astra_data.dataset.columns import ACTION, NEXT_STATE, OUTCOME_COLUMNS, STATE, Array, Column, Episode
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.writer import DatasetWriter
 

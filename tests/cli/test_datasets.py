@@ -59,8 +59,7 @@ def test_episodes_are_those_between_the_bounds_and_of_the_stored_order(fake: str
     assert uids("filter", "--min-length", "5", "--max-length", "12") == [13, 2**53 + 1, 0]
     stored = subset(open_dataset(fake), episodes=3, out=tmp_path / "stored")
     taken = uids("subset", "--episodes", "3")
-    assert taken == open_dataset(stored).uids.tolist()
-    assert taken != uids("subset", "--episodes", "3", "--seed", "0")
+    assert taken == open_dataset(stored).uids.tolist() and taken != uids("subset", "--episodes", "3", "--seed", "0")
 
 
 def test_a_refused_edit_writes_nothing(fake: str) -> None:
@@ -96,8 +95,7 @@ def test_findings_are_shown_and_written(tmp_path: Path) -> None:
     lines = result.output.splitlines()
     found = json.loads((tmp_path / "found.json").read_text())
     (finding,) = found["findings"]
-    assert finding["episodes"] == [*range(21, 30)]
-    assert f"astra-data filter '{logs}' --without 21" in finding["advice"]
+    assert finding["episodes"] == [*range(21, 30)] and f"astra-data filter '{logs}' --without 21" in finding["advice"]
     shown = "warning: " + finding["what"] + " (episodes 21, 22, 23, 24, 25 and 4 more): " + finding["advice"]
     assert lines[-5:] == ["check-up", *found["summary"], shown, f"written: {tmp_path / 'found.json'}"][-5:]
 
@@ -212,8 +210,7 @@ def test_validate_and_repair(
     assert called(monkeypatch, "repair", root, "--out", tmp_path / "saved") == 0
     assert "finished: " in capsys.readouterr().out
     assert called(monkeypatch, "repair", root, "--out", tmp_path / "saved") == 1
-    assert "exists already" in capsys.readouterr().err
-    assert called(monkeypatch, "validate", tmp_path / "saved") == 0
+    assert "exists already" in capsys.readouterr().err and called(monkeypatch, "validate", tmp_path / "saved") == 0
 
 
 @pytest.mark.parametrize(

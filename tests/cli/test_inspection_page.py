@@ -55,8 +55,7 @@ def test_a_page_sums_up_the_dataset(success: int | None) -> None:
     assert any(line.startswith("episodes end: 2 terminated, 1 cut off; 1 next states of") for line in lines)
     table = lines[lines.index("action (2) float32") + 1 :]
     assert table[0].split() == ["value", "unit", "min", "mean", "max", "spread"]
-    assert table[1].split() == ["vx", "m/s", "-1", "0", "1"]
-    assert table[2].split() == ["vy", "m/s", "0", "0", "0.1235"]
+    assert table[1].split() == ["vx", "m/s", "-1", "0", "1"] and table[2].split() == ["vy", "m/s", "0", "0", "0.1235"]
     assert table[3] == "positions, x -1.0 to 0.0 m, y 2.0 to 3.0 m" and table[4] == "█"
     assert table[5:8] == ["check-up", "endings: 3 cut", "rate: 20 Hz declared"]
     assert table[8:] == ["nothing looks wrong in the values; `astra-data validate` also checks all files"]

@@ -227,8 +227,7 @@ def test_every_way_to_end_is_counted() -> None:
     assert line == (
         "1 in success, 1 in failure, 1 terminated, success unknown, 2 after 50 steps, the longest (a time limit), 1 cut"
     )
-    assert found.episodes == (1,)
-    assert endings([0, 1], np.array([9, 12]), np.zeros(2, bool), None) == ("2 cut", [])
+    assert found.episodes == (1,) and endings([0, 1], np.array([9, 12]), np.zeros(2, bool), None) == ("2 cut", [])
     line, findings = endings([0, 1], np.array([9, 9]), None, None)
     assert line.startswith("unknown") and not findings
 

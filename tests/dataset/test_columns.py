@@ -82,11 +82,7 @@ def test_one_value_per_step_may_be_given_as_gymnasium_has_it() -> None:
 
 @pytest.mark.parametrize(
     ("columns", "part"),
-    [
-        ({}, "no columns"),
-        ({STATE: np.zeros((0, 2), np.float32)}, "no steps"),
-        ({STATE: np.float32(1)}, "shape ()"),
-    ],
+    [({}, "no columns"), ({STATE: np.zeros((0, 2), np.float32)}, "no steps"), ({STATE: np.float32(1)}, "shape ()")],
 )
 def test_an_empty_episode_is_refused(columns: dict[str, Array], part: str) -> None:
     with pytest.raises(BadInputError) as caught:

@@ -24,8 +24,7 @@ def test_a_description_is_completed_with_defaults_packages_and_the_machine() -> 
         {"name": "walks", "stage": "pair", "parents": [PARENT], "config": {"a": (1, 2)}}
     )
     assert full["version"] == "1.0.0" and full["parents"] == [PARENT] and full["config"] == {"a": [1, 2]}
-    assert full["packages"]["numpy"] == np.__version__
-    assert full["machine"]["cores"] == len(os.sched_getaffinity(0))
+    assert full["packages"]["numpy"] == np.__version__ and full["machine"]["cores"] == len(os.sched_getaffinity(0))
     assert full["seeds"] == full["environment"] == full["simulator"] == {}
 
 

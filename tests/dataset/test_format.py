@@ -26,8 +26,7 @@ def test_constants_are_lerobots(lerobot: SimpleNamespace) -> None:
     assert layout.VIDEO_FILE_SIZE_MB == files.DEFAULT_VIDEO_FILE_SIZE_IN_MB
     assert (layout.INFO_PATH, layout.STATS_PATH) == (files.INFO_PATH, files.STATS_PATH)
     assert layout.TASKS_PATH == files.DEFAULT_TASKS_PATH and layout.EPISODES_PATH == files.DEFAULT_EPISODES_PATH
-    assert layout.DATA_PATH == files.DEFAULT_DATA_PATH
-    assert list(layout.QUANTILES) == lerobot.package.DEFAULT_QUANTILES
+    assert layout.DATA_PATH == files.DEFAULT_DATA_PATH and list(layout.QUANTILES) == lerobot.package.DEFAULT_QUANTILES
     defaults = {c.name: c.feature() | {"shape": (c.size,)} for c in layout.DEFAULT_COLUMNS}
     assert defaults == lerobot.names.DEFAULT_FEATURES
 
@@ -62,8 +61,7 @@ def test_info_has_lerobots_fields(lerobot: SimpleNamespace, fake: Dataset) -> No
 
 def test_the_tasks_table_is_a_pandas_frame_with_the_task_as_index() -> None:
     frame = layout.tasks_table("walk").to_pandas()
-    assert (frame.index.name, frame.index.tolist()) == ("task", ["walk"])
-    assert frame["task_index"].tolist() == [0]
+    assert (frame.index.name, frame.index.tolist()) == ("task", ["walk"]) and frame["task_index"].tolist() == [0]
 
 
 @pytest.fixture(scope="module")

@@ -117,8 +117,7 @@ def test_an_epoch_holds_every_sample_once_in_an_order_of_its_own() -> None:
     assert all(sorted(indices) == list(range(1000)) for indices in epochs)
     assert epochs[0] != epochs[1] != epochs[2] != epochs[0]
     same, other = Order(1000, 7, seed=1), Order(1000, 32, seed=2)
-    assert epoch(same) == epochs[0]
-    assert epoch(other) != epochs[0]
+    assert epoch(same) == epochs[0] and epoch(other) != epochs[0]
     assert abs(np.corrcoef(epochs[0], epochs[1])[0, 1]) < 0.2
 
 
@@ -132,13 +131,7 @@ def test_without_shuffling_the_order_is_the_samples() -> None:
 
 def test_a_state_of_another_order_is_refused() -> None:
     state = Order(20, 5, seed=4).state_dict()
-    for other in (
-        state | {"count": 21},
-        state | {"seed": 0},
-        state | {"batch": 4},
-        state | {"epoch": -1},
-        {},
-    ):
+    for other in (state | {"count": 21}, state | {"seed": 0}, state | {"batch": 4}, state | {"epoch": -1}, {}):
         with pytest.raises(BadInputError, match="the state is of another order of samples: expected"):
             Order(20, 5, seed=4).load_state_dict(other)
 
@@ -152,8 +145,7 @@ def test_valid_windows_are_all_that_lie_inside_an_episode(fake: Dataset, frames:
     ]
     windows = frames.windows(6, stride=stride)
     batch = everything(windows)
-    assert batch[INDEX].tolist() == [list(rows) for rows in expected]
-    assert not batch["is_pad"].any()
+    assert batch[INDEX].tolist() == [list(rows) for rows in expected] and not batch["is_pad"].any()
     for name in NAMES:
         np.testing.assert_array_equal(batch[name].numpy(), fake.columns([name])[name][batch[INDEX].numpy()])
 

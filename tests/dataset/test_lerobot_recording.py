@@ -102,8 +102,7 @@ def test_next_states_are_those_of_the_following_rows(arm: Dataset) -> None:
         np.testing.assert_array_equal(episode.columns[DONE], last)
         assert set(episode.columns[RECORDED_TASK]) == {number % 2}
     assert arm.metadata == {"success": [True, False, True], "task": ["lift", "lift", "turn"]}
-    assert arm.specs([NEXT_STATE])[0].names == tuple(JOINTS)
-    assert (arm.task, arm.info["fps"]) == ("lift / turn", 10)
+    assert arm.specs([NEXT_STATE])[0].names == tuple(JOINTS) and (arm.task, arm.info["fps"]) == ("lift / turn", 10)
     assert arm.description["environment"] == {"robot_type": "so101"}
 
 

@@ -33,8 +33,7 @@ def test_values_go_to_arrow_and_back(values: Array, kind: pa.DataType) -> None:
 
 def test_rows_become_lists() -> None:
     values = np.arange(6.0).reshape(2, 3)
-    assert to_lists(values).to_pylist() == values.tolist()
-    assert to_lists(values.T).to_pylist() == values.T.tolist()
+    assert to_lists(values).to_pylist() == values.tolist() and to_lists(values.T).to_pylist() == values.T.tolist()
 
 
 @pytest.mark.parametrize(

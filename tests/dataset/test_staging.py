@@ -30,8 +30,7 @@ def test_a_recording_is_the_dataset_that_is_written_at_once(tmp_path: Path) -> N
     with staged_writer(tmp_path / "set") as writer:
         for episode in fake_episodes():
             writer.add(episode)
-    assert contents(tmp_path / "set") == contents(write_fake(tmp_path / "whole").root)
-    assert leftovers(tmp_path) == []
+    assert contents(tmp_path / "set") == contents(write_fake(tmp_path / "whole").root) and leftovers(tmp_path) == []
 
 
 def test_positions_order_the_episodes(tmp_path: Path) -> None:

@@ -89,8 +89,7 @@ def test_rows_locate_the_episodes_and_hold_their_statistics(
     assert pq.read_metadata(path).num_row_groups == math.ceil(3 / rows_at_once)
     table = pq.read_table(path)
     assert table.column("episode_index").to_pylist() == [0, 1, 2]
-    assert table.column("tasks").to_pylist() == [["walk"]] * 3
-    assert table.column("length").to_pylist() == list(LENGTHS)
+    assert table.column("tasks").to_pylist() == [["walk"]] * 3 and table.column("length").to_pylist() == list(LENGTHS)
     assert table.column("dataset_from_index").to_pylist() == [0, 4, 5]
     assert table.column("dataset_to_index").to_pylist() == [4, 5, 12]
     assert table.column("data/chunk_index").to_pylist() == [0, 1, 2]

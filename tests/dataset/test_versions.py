@@ -9,15 +9,7 @@ from fake_dataset import write_fake
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import Column
 from astra_data.dataset.edit import subset
-from astra_data.dataset.versions import (
-    Version,
-    home_of,
-    locate,
-    names_at_home,
-    next_version,
-    open_dataset,
-    successor,
-)
+from astra_data.dataset.versions import Version, home_of, locate, names_at_home, next_version, open_dataset, successor
 
 
 def versions(*texts: str) -> list[Version]:
@@ -104,8 +96,7 @@ def test_a_successor_of_another_name_begins_anew(home: Path, tmp_path: Path) -> 
     assert (description["name"], description["version"]) == ("half", "1.0.0")
     assert description["parents"] == [source.identity]
     folder.mkdir(parents=True)
-    assert successor(source.description, "episodes", **asked)[0]["version"] == "1.1.0"
-    assert names_at_home() == ["half"]
+    assert successor(source.description, "episodes", **asked)[0]["version"] == "1.1.0" and names_at_home() == ["half"]
 
 
 def test_a_name_that_means_a_subset_says_so(home: Path, caplog: pytest.LogCaptureFixture) -> None:

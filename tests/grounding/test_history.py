@@ -226,8 +226,7 @@ def test_a_saved_state_goes_on_with_its_parameters() -> None:
 def test_a_saved_state_holds_what_a_simulator_remembers() -> None:
     walker = TASKS["humanoid-walker2d"]
     one = EpisodeSimulator(walker.simulator(2))
-    assert plain(1).state_dict().keys() == {"state"}
-    assert one.state_dict().keys() == {"state", "memory"}
+    assert plain(1).state_dict().keys() == {"state"} and one.state_dict().keys() == {"state", "memory"}
     memory = torch.rand_like(one.state_dict()["memory"])
     one.load_state_dict(one.state_dict() | {"memory": memory})
     assert torch.equal(one.state_dict()["memory"], memory)

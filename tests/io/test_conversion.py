@@ -29,8 +29,7 @@ def test_take_scale_offset_and_clip_follow_each_other() -> None:
     spec = {"take": (2, 0), "scale": (2.0, 10.0), "offset": (1.0, -1.0), "clip": (-5.0, 20.0)}
     values, finite = convert(spec, [[1, 7, 3], [4, 7, 100], [-9, 7, 0]])
     # (3 · 2 + 1, 1 · 10 - 1), (201 cut to 20, 39 cut to 20), (1, -91 cut to -5)
-    assert values.tolist() == [[7, 9], [20, 20], [1, -5]] and values.dtype == np.float32
-    assert finite == [True] * 3
+    assert values.tolist() == [[7, 9], [20, 20], [1, -5]] and values.dtype == np.float32 and finite == [True] * 3
 
 
 def test_recorded_next_states_are_described_as_the_states_unless_the_mapping_says_more() -> None:

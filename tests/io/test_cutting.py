@@ -83,8 +83,7 @@ def test_a_terminated_row_without_a_next_state_hands_its_outcome_to_the_step_bef
     assert [episode[TRUNCATED].tolist() for episode in episodes] == [[False, False], [False], [True]]
     assert cutting.tally.endings == Endings(terminated=2, cut_off=1)
     tally = cutting.tally
-    assert (tally.last_rows, tally.last_terminated, tally.last_reward) == (3, 2, 7)
-    assert tally.rows_after_end == 1
+    assert (tally.last_rows, tally.last_terminated, tally.last_reward) == (3, 2, 7) and tally.rows_after_end == 1
 
 
 @pytest.mark.parametrize("terminal", ["drop", "stand_still"])
@@ -206,15 +205,13 @@ def test_a_rejected_row_that_ends_its_episode_is_no_gap_and_changes_no_rate() ->
     cutting = cutter(time="t", not_finite="split", split={"gap_s": 0.15})
     x = np.where(np.arange(60) % 3 == 2, np.nan, 0.0)
     episodes = cut(cutting, x=x, t=np.arange(60) / 10)
-    assert rows(episodes) == [[first] for first in range(0, 60, 3)]
-    assert cutting.tally.split_points == {"rejected": 19}
+    assert rows(episodes) == [[first] for first in range(0, 60, 3)] and cutting.tally.split_points == {"rejected": 19}
     cutting.check()
 
 
 def test_short_episodes_are_left_out_and_counted() -> None:
     cutting = cutter(split={"field": "k"}, min_steps=2)
-    assert rows(cut(cutting, x=np.zeros(6), k=[0, 0, 1, 1, 1, 1])) == [[2, 3, 4]]
-    assert cutting.tally.short_rows == 1
+    assert rows(cut(cutting, x=np.zeros(6), k=[0, 0, 1, 1, 1, 1])) == [[2, 3, 4]] and cutting.tally.short_rows == 1
 
 
 def test_a_success_in_the_last_row_is_that_of_the_step_that_leads_to_it() -> None:

@@ -181,8 +181,7 @@ def check(read: Timeline) -> list[McapMessage]:
     """Compare the times of messages with the moments, and return the messages."""
     messages = list(read.messages())
     times = [message.time for message in messages]
-    assert times == sorted(times)
-    assert read.moments.keys() == {"/pose", "/command"}
+    assert times == sorted(times) and read.moments.keys() == {"/pose", "/command"}
     for topic, moments in read.moments.items():
         assert moments.tolist() == [message.time for message in messages if message.topic == topic]
     return messages

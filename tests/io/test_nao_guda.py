@@ -57,8 +57,7 @@ def test_the_real_logs(tmp_path: Path) -> None:
             rows.append(np.array(json.load(file)["observations"]))
     position = np.concatenate(rows)
     jumps = np.linalg.norm(np.diff(position[:, :2], axis=0), axis=1) > 500
-    assert report.tally.rows == len(position) == 20_000
-    assert report.tally.split_points == {"jump": int(jumps.sum())}
+    assert report.tally.rows == len(position) == 20_000 and report.tally.split_points == {"jump": int(jumps.sum())}
     lengths = np.diff([0, *np.flatnonzero(jumps) + 1, 20_000]) - 1
     assert dataset.lengths.tolist() == [length for length in lengths if length >= 60]
     first = (position[0] * [0.001, 0.001, 1, 0.001, 0.001]).astype(np.float32)

@@ -121,8 +121,7 @@ def test_the_first_update_of_ppo_is_that_of_the_package(both: tuple[Any, ...]) -
     figures = ppo.iterate()
     torch.manual_seed(derive(0, "iteration 0"))
     success = my_ppo.iterate()
-    assert success == pytest.approx(figures["success"])
-    assert my_ppo.share == pytest.approx(ppo.share)
+    assert success == pytest.approx(figures["success"]) and my_ppo.share == pytest.approx(ppo.share)
     moved = 0.0
     for (name, mine_now), first in zip(my_policy.state_dict().items(), before, strict=True):
         expected: Tensor = policy.state_dict()[name]

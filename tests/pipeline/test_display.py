@@ -34,8 +34,7 @@ def test_in_a_terminal_finished_items_become_lines_above_the_running_ones() -> N
         watch("train/nas/seed_1", (0.25, "success 0.84 [x]"))
     assert "train/nas/seed_0  finished in 3.0 s" in file.getvalue()
     whole, running = file.getvalue().rpartition("1 of 2 finished")[2].splitlines()[:2]
-    assert "50%" in whole
-    assert "train/nas/seed_1" in running and "25%" in running and "success 0.84 [x]" in running
+    assert "50%" in whole and "train/nas/seed_1" in running and "25%" in running and "success 0.84 [x]" in running
 
 
 def test_in_80_columns_bar_share_and_time_left_stay() -> None:
@@ -45,8 +44,7 @@ def test_in_80_columns_bar_share_and_time_left_stay() -> None:
         watch(key, None)
         watch(key, (0.5, note))
     *_, line = (line for line in file.getvalue().splitlines() if "train/direct" in line)
-    assert len(line.rstrip()) <= 80
-    assert re.search(r"train/direct\S*… .*━{9}.* 50% 0:00:00 31 k.*…", line)
+    assert len(line.rstrip()) <= 80 and re.search(r"train/direct\S*… .*━{9}.* 50% 0:00:00 31 k.*…", line)
 
 
 def test_the_time_left_counts_work_not_items() -> None:
@@ -61,8 +59,7 @@ def test_the_time_left_counts_work_not_items() -> None:
     assert estimate.left() is None and estimate.left_of("train/nas/seed_0") is None
     now[0] = 25.0
     estimate.add("train/nas/seed_0", (0.1, ""))  # 200 s in all
-    assert estimate.left_of("train/nas/seed_0") == pytest.approx(180)
-    assert estimate.left() == pytest.approx(180 + 200)
+    assert estimate.left_of("train/nas/seed_0") == pytest.approx(180) and estimate.left() == pytest.approx(180 + 200)
     estimate.add("train/nas/seed_1", None)
     assert estimate.left() == pytest.approx(200)  # two at a time, and not before the longer one ends
     now[0] = 125.0

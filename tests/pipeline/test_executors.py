@@ -48,8 +48,7 @@ def test_items_begin_when_their_inputs_are_finished_and_a_job_is_free(jobs: int 
     items = [Item(key, inputs, no_call) for key, inputs in names.items()]
     workshop = Workshop()
     run_in_order(items, jobs, Record(), workshop.begin, workshop.events)
-    assert workshop.begun == ["a", "b", "c", "last"]
-    assert workshop.most == most
+    assert workshop.begun == ["a", "b", "c", "last"] and workshop.most == most
 
 
 def prepared() -> None:
@@ -62,9 +61,7 @@ def test_what_an_item_prints_is_in_its_log_and_an_empty_log_is_removed(
 ) -> None:
     work = pickled(Item("a", (), partial(touch, tmp_path / "made", ())), None)
     seconds = run_item("a", work, tmp_path / "logs/x/y/a.txt", lambda note: None)
-    assert isinstance(seconds, float)
-    assert 0 < seconds < 60
-    assert (tmp_path / "made").exists()
+    assert isinstance(seconds, float) and 0 < seconds < 60 and (tmp_path / "made").exists()
     assert not (tmp_path / "logs/x/y/a.txt").exists()
     log = tmp_path / "logs/b/c.txt"
     error = run_item("b/c", pickled(Item("b/c", (), crash), prepared), log, lambda note: None)
@@ -73,9 +70,7 @@ def test_what_an_item_prints_is_in_its_log_and_an_empty_log_is_removed(
     os.write(1, b"ours again\n")
     os.write(2, b"and ours\n")
     shown = capfd.readouterr()
-    assert "ours again\n" in shown.out
-    assert "and ours\n" in shown.err
-    assert "with care" not in shown.err
+    assert "ours again\n" in shown.out and "and ours\n" in shown.err and "with care" not in shown.err
 
 
 def keep(path: Path, value: float) -> None:
@@ -177,8 +172,7 @@ def test_a_crash_tells_its_last_line_and_where_its_traceback_is(tmp_path: Path) 
     with pytest.raises(AstraDataError, match=r"^a/b crashed: ValueError: a bug \(traceback: .*b\.txt\)$"):
         execute([Item("a/b", (), crash)], jobs=1, logs=tmp_path, watch=Record())
     log = (tmp_path / "a/b.txt").read_text()
-    assert "about to crash" in log
-    assert "Traceback" in log
+    assert "about to crash" in log and "Traceback" in log
 
 
 @pytest.mark.parametrize(
@@ -210,8 +204,7 @@ def test_ctrl_c_stops_the_processes(tmp_path: Path) -> None:
     # As in a terminal, Ctrl-C reaches the whole process group.
     os.killpg(parent.pid, signal.SIGINT)
     _, errors = parent.communicate(timeout=PATIENCE_S)
-    assert errors.splitlines().count(b"KeyboardInterrupt") == 1
-    assert _is_gone(int((tmp_path / "pid").read_text()))
+    assert errors.splitlines().count(b"KeyboardInterrupt") == 1 and _is_gone(int((tmp_path / "pid").read_text()))
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -221,8 +214,7 @@ def test_a_signal_to_a_run_in_the_background_stops_its_processes(tmp_path: Path,
     parent.send_signal(number)
     parent.send_signal(number)
     _, errors = parent.communicate(timeout=PATIENCE_S)
-    assert errors.splitlines().count(b"KeyboardInterrupt") == 1
-    assert _is_gone(int((tmp_path / "pid").read_text()))
+    assert errors.splitlines().count(b"KeyboardInterrupt") == 1 and _is_gone(int((tmp_path / "pid").read_text()))
 
 
 def test_no_process_outlives_a_killed_run(tmp_path: Path) -> None:

@@ -60,8 +60,7 @@ def world_of(run: Path, row: str, **options: Any) -> SimulatorEnv:
 )
 def test_gymnasiums_own_checks_pass_for_a_task_of_ones_own(run: Path, row: str, size: int) -> None:
     env = gymnasium.make(ID, run=str(run), row=row, seed=0)
-    assert env.observation_space.shape == (size,)
-    assert env.action_space == gymnasium.spaces.Box(-1, 1, (2,))
+    assert env.observation_space.shape == (size,) and env.action_space == gymnasium.spaces.Box(-1, 1, (2,))
     check_env(env.unwrapped, skip_render_check=True)
 
 
@@ -227,8 +226,7 @@ def test_in_a_target_latents_come_from_the_aligned_encoder(run: Path, tmp_path: 
     inputs: dict[str, Any] = {name: run / stage / "astra/seed_0" for name, stage in parts.items()}
     evaluate(task, "astra", EvaluateConfig(episodes=3, encoder="target"), **inputs, out=tmp_path / "row")
     own, row = (json.loads((tmp_path / name / "evaluation.json").read_text()) for name in ("own", "row"))
-    assert own["target"] == row["target"] and own["encoders"] == row["encoders"]
-    assert own["encoder"] == "target"
+    assert own["target"] == row["target"] and own["encoders"] == row["encoders"] and own["encoder"] == "target"
 
 
 @pytest.mark.parametrize(("latent_r2", "deployed"), [(0.89, False), (0.95, True)])

@@ -23,8 +23,7 @@ def load(folder: Path, text: str) -> Recipe:
 def test_rows_read_what_their_method_needs(tmp_path: Path) -> None:
     recipe = load(tmp_path, HEAD)
     items = {item.key: item for item in plan(recipe, tmp_path / "r.toml", tmp_path)}
-    assert len(items) == 2 * (1 + 1 + 1 + 3 + 1 + 4) + 1
-    assert items["ground/astra/seed_7"].inputs == ("pair/seed_7",)
+    assert len(items) == 2 * (1 + 1 + 1 + 3 + 1 + 4) + 1 and items["ground/astra/seed_7"].inputs == ("pair/seed_7",)
     assert items["train/direct_transfer/seed_0"].inputs == ("pair/seed_0",)
     assert items["train/astra_plus/seed_0"].inputs == ("pair/seed_0", "ground/astra/seed_0")
     assert items["evaluate/follower/seed_0"].inputs == ()
@@ -163,8 +162,7 @@ def test_a_choice_reads_all_policies_and_groundings_that_it_needs(tmp_path: Path
     policies = {f"train/{row}/seed_{seed}" for row in rows for seed in seeds}  # neither follower nor target
     groundings = {f"ground/{owner}/seed_{seed}" for owner in ("astra", "nas") for seed in seeds}
     assert set(items["select"].inputs) == policies | groundings
-    assert [item.key for item in planned][-2:] == ["select", "report"]
-    assert items["report"].inputs[-1] == "select"
+    assert [item.key for item in planned][-2:] == ["select", "report"] and items["report"].inputs[-1] == "select"
     call = items["select"].call
     assert isinstance(call, partial) and call.keywords == {"root": tmp_path}
     assert call.args[0].methods == recipe.methods and call.args[1].episodes == 3
@@ -233,8 +231,7 @@ def test_who_was_trained_in_the_target_goes_beyond_no_recorded_commands(tmp_path
     items = plan(load(tmp_path, text), tmp_path / "r.toml", tmp_path)
     calls = {item.key: item.call for item in items if item.key.startswith("evaluate")}
     known = {key: call.keywords["recorded"] for key, call in calls.items() if isinstance(call, partial)}
-    assert known["evaluate/target/seed_0"] is None
-    assert known["evaluate/astra/seed_0"] == tmp_path / "pair/seed_0"
+    assert known["evaluate/target/seed_0"] is None and known["evaluate/astra/seed_0"] == tmp_path / "pair/seed_0"
 
 
 def test_a_stage_is_named_as_the_function_that_makes_it() -> None:

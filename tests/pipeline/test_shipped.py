@@ -23,8 +23,7 @@ def test_every_recipe_is_shipped_and_says_what_it_is() -> None:
     for recipe in recipes:
         assert recipe.about.endswith("."), recipe.name
         assert "astra-data run" not in recipe.about
-    assert shipped("leg_scale").task == "antmaze-umaze"
-    assert shipped("humanoid_extended").task == "humanoid-extended"
+    assert shipped("leg_scale").task == "antmaze-umaze" and shipped("humanoid_extended").task == "humanoid-extended"
 
 
 @pytest.mark.usefixtures("forgotten_methods")

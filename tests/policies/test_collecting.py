@@ -226,8 +226,7 @@ def test_sac_stops_once_episodes_last_or_after_its_steps(
         progress=lambda share, note: shares.append(share),
     )
     assert metadata["trained_steps"] == trained and shares[0] == pytest.approx(max(100 / steps, 10 / 50))
-    assert shares[-1] == 1.0
-    assert seeds == [derive(3, f"trial {100 * (count + 1)}") for count in range(len(seeds))]
+    assert shares[-1] == 1.0 and seeds == [derive(3, f"trial {100 * (count + 1)}") for count in range(len(seeds))]
     assert type(policy.policy) is SoftActor and policy.observed == "full"
     config = Counting.made[0].config
     assert isinstance(config, SacConfig) and (config.total_steps, config.discount) == (steps, 0.99)

@@ -61,8 +61,7 @@ def test_failures_are_told_apart_from_successes() -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_gymnasiums_own_checks_pass(name: str) -> None:
     env = gymnasium.make(name)
-    assert isinstance(env.unwrapped, SingleEnv)
-    assert env.observation_space.shape == ((31,) if "Ant" in name else (8,))
+    assert isinstance(env.unwrapped, SingleEnv) and env.observation_space.shape == ((31,) if "Ant" in name else (8,))
     assert env.action_space == gymnasium.spaces.Box(-1, 1, (2,))
     check_env(env.unwrapped, skip_render_check=True)
 

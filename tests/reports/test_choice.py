@@ -166,8 +166,7 @@ def test_the_field_is_as_wide_as_the_trials_allow() -> None:
             continue
         found = halve([0.5] * field, trials, certain([1] * field), field=field)
         assert all(each >= LEAST_TRIALS for _, each in found.rounds)
-        assert sum(len(those) * each for those, each in found.rounds) <= trials
-        assert len(found.rounds[0][0]) == field
+        assert sum(len(those) * each for those, each in found.rounds) <= trials and len(found.rounds[0][0]) == field
         for (those, _), (after, _) in zip(found.rounds, found.rounds[1:], strict=False):
             assert len(after) == ceil(len(those) / 2)
 

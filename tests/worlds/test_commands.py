@@ -146,8 +146,7 @@ def test_commands_vary_from_episode_to_episode() -> None:
     torch.manual_seed(0)
     noisy = TASK.varied_simulator(500, CommandVariation(action_noise=(0.05, 0.05)))
     landed = noisy.step(torch.zeros(500, 1))
-    assert abs(float(landed.std()) / (0.05 * 2.5 * 0.1) - 1.0) < 0.1
-    assert abs(float(landed.mean()) - 0.15) < 0.002
+    assert abs(float(landed.std()) / (0.05 * 2.5 * 0.1) - 1.0) < 0.1 and abs(float(landed.mean()) - 0.15) < 0.002
 
 
 class InPlace:

@@ -134,8 +134,7 @@ def test_every_task_has_a_simulator_of_the_kind_that_tasks_need(task: Task) -> N
     simulator.reset_to(changed[2:], rows)
     assert torch.equal(simulator.state, changed)
     simulator.reset_to(state)
-    assert torch.equal(simulator.state, state)
-    assert not simulator.blocked.any() and simulator.blocked.shape == (3,)
+    assert torch.equal(simulator.state, state) and not simulator.blocked.any() and simulator.blocked.shape == (3,)
     assert isinstance(simulator.parameters, Mapping)
     stepped = simulator.step(torch.zeros(3, task.objective.action_size))
     assert torch.equal(stepped, simulator.state) and stepped.dtype == torch.float32

@@ -173,8 +173,7 @@ def test_what_is_measured_is_of_the_copys_own_last_step() -> None:
     control = np.zeros((3, 8))
     control[:, 0] = [0.5, -0.25, 1.0]
     physics.step(control, np.array([True, False, True]))
-    assert physics.measured[:, 0].tolist() == [0.5, 0.0, 1.0]
-    assert physics.measured[:, 1].tolist() == [0.5, 0.0, 1.0]
+    assert physics.measured[:, 0].tolist() == [0.5, 0.0, 1.0] and physics.measured[:, 1].tolist() == [0.5, 0.0, 1.0]
     np.testing.assert_array_equal(physics.measured[:, 2], physics.qpos[:, 2])
     assert physics.measured[0, 2] != 1.0
     unmeasured = BatchedPhysics(model, 1, substeps=1, num_threads=1)

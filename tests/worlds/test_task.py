@@ -126,8 +126,7 @@ class AloneOnTheCpu(Rail):
 
 def test_states_are_on_the_device_of_the_task_though_the_simulator_takes_none() -> None:
     task = replace(TASK, make_simulator=AloneOnTheCpu, commands={"v": (-1.0, 1.0)})
-    assert isinstance(task.simulator(2), AloneOnTheCpu)
-    assert task.simulator(2, "meta").state.device.type == "meta"
+    assert isinstance(task.simulator(2), AloneOnTheCpu) and task.simulator(2, "meta").state.device.type == "meta"
 
 
 def test_a_task_without_a_target_says_so() -> None:

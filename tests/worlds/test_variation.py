@@ -52,8 +52,7 @@ def test_it_survives_json_and_knows_its_parameters(kind: type[Variation]) -> Non
 def test_noise_carries_no_command_beyond_one() -> None:
     torch.manual_seed(0)
     noisy = of.noisy_command(torch.tensor([[1.0, -1.0, 0.0]]).expand(1000, 3), torch.full((1000, 1), 0.1))
-    assert noisy.max() == 1.0 and noisy.min() == -1.0
-    assert float(noisy[:, 2].std()) == pytest.approx(0.1, rel=0.1)
+    assert noisy.max() == 1.0 and noisy.min() == -1.0 and float(noisy[:, 2].std()) == pytest.approx(0.1, rel=0.1)
 
 
 @pytest.mark.parametrize("model", [PlanarVariation, BallVariation])

@@ -27,8 +27,7 @@ def versioned(root: Path, version: str, **changes: object) -> Dataset:
 def test_what_is_pulled_is_what_was_pushed(hub: Hub, fake: Dataset, home: Path) -> None:
     told: list[tuple[float, str]] = []
     pushed = push(fake.root, "me/it", progress=lambda share, note: told.append((share, note)))
-    assert pushed == "hf://datasets/me/it@data-1.0.0"
-    assert (sorted(told), told[-1]) == (told, (1.0, "data-1.0.0"))
+    assert pushed == "hf://datasets/me/it@data-1.0.0" and (sorted(told), told[-1]) == (told, (1.0, "data-1.0.0"))
     repo = hub.repos["me/it"]
     assert not repo.private and repo.history == ["initial commit", "Add fake@data-1.0.0"]
     assert repo.tags == {"v3.0": repo.head, "data-1.0.0": repo.head}

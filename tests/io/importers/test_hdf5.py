@@ -44,8 +44,7 @@ def test_d4rl_needs_no_mapping(tmp_path: Path) -> None:
 def test_without_next_observations_episodes_lose_their_last_row(tmp_path: Path) -> None:
     fields = d4rl(tmp_path / "ant.hdf5", next_observations=False)
     dataset, report = imported(tmp_path, tmp_path / "ant.hdf5", None, name="ant", fps=20)
-    assert dataset.lengths.tolist() == [6, 4]
-    assert (report.tally.last_rows, report.tally.last_terminated) == (2, 1)
+    assert dataset.lengths.tolist() == [6, 4] and (report.tally.last_rows, report.tally.last_terminated) == (2, 1)
     assert report.tally.last_reward == pytest.approx(fields["rewards"][11])
     state, got = fields["observations"], dataset.columns([NEXT_STATE, TERMINATED, TRUNCATED, REWARD])
     np.testing.assert_array_equal(got[NEXT_STATE], [*state[1:7], *state[8:]])

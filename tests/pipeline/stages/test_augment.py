@@ -73,8 +73,7 @@ def test_episodes_are_as_many_as_asked_and_none_is_lost(collected: Path, augment
     assert len(dataset) == CONFIG.episodes and dataset.verify() == []
     assert dataset.description["version"] == "1.1.0" and dataset.description["parents"] == [source.identity]
     assert dataset.description["seeds"] == source.description["seeds"] | {"augment": 1}
-    assert dataset.description["copies"] == CONFIG.episodes - len(source)
-    assert dataset.features == source.features
+    assert dataset.description["copies"] == CONFIG.episodes - len(source) and dataset.features == source.features
     kept = {episode.uid: episode for episode in dataset.episodes()}
     for episode in source.episodes():
         for name, values in episode.columns.items():

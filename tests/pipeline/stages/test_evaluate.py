@@ -97,8 +97,7 @@ def check_outcome(outcome: dict[str, list[float]], position: Tensor) -> None:
         assert 1 <= steps <= HORIZON
         ended = outcome["success"][episode] + outcome["failed"][episode]
         assert ended in ((0, 1) if steps == HORIZON else (1,)) and 0 <= outcome["wall_contact"][episode] <= 1
-        assert math.isfinite(outcome["return"][episode])
-        assert torch.isfinite(position[episode, : steps + 1]).all()
+        assert math.isfinite(outcome["return"][episode]) and torch.isfinite(position[episode, : steps + 1]).all()
         assert position[episode, steps + 1 :].isnan().all()
 
 
@@ -184,8 +183,7 @@ def test_a_policy_that_was_in_no_simulator_is_tested_in_the_target_alone(
     policy = ActorCritic(ActorCriticShape(observation_size=8, action_size=2, memory_size=4))
     replace(grounded_policy, policy=policy, simulation=None).save(tmp_path / "policy.safetensors")
     told, paths = make(task, "iql", tmp_path / "out", {"policy": tmp_path})
-    assert "simulated" not in told and "simulated.position" not in paths
-    assert told["encoders"].keys() == {"source"}
+    assert "simulated" not in told and "simulated.position" not in paths and told["encoders"].keys() == {"source"}
     check_outcome(told["target"], paths["target.position"])
 
 
@@ -232,8 +230,7 @@ def test_where_there_are_pictures_the_states_of_the_first_episode_are_kept(
     monkeypatch.setitem(TASKS, task, replace(TASKS[task], photograph=lambda states: np.zeros((1, 2, 2, 3), np.uint8)))
     told, paths = make(task, "follower", tmp_path / "out")
     filmed, steps = paths["target.state"], int(told["target"]["steps"][0])
-    assert filmed.shape == (steps + 1, 29)
-    assert torch.equal(filmed[:, :2], paths["target.position"][0, : steps + 1])
+    assert filmed.shape == (steps + 1, 29) and torch.equal(filmed[:, :2], paths["target.position"][0, : steps + 1])
 
 
 def test_an_episode_ends_with_its_success(

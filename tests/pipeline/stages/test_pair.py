@@ -46,8 +46,7 @@ def test_the_simulator_starts_where_the_target_was_and_takes_its_action(paired: 
 def test_all_else_stays_and_the_parent_is_recorded(collected: Path, paired: Path) -> None:
     before, after = Dataset.open(collected), Dataset.open(paired)
     assert after.description["parents"] == [before.identity]
-    assert after.reference == before.reference.replace("1.0.0", "2.0.0")
-    assert after.description["reset_error"] == 0.0
+    assert after.reference == before.reference.replace("1.0.0", "2.0.0") and after.description["reset_error"] == 0.0
     assert after.description["simulator"] == {
         "id": "point_mass",
         "task": "antmaze-short",

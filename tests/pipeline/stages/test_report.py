@@ -75,8 +75,7 @@ def target(root: Path) -> Iterator[str]:
 
 def test_a_report_is_complete_and_its_pages_say_the_same(rough: None, root: Path, target: str) -> None:
     folder = root / "report"
-    assert images(folder) == FIGURES
-    assert {name for name in FIGURES if f"]({name}.png)" in target} == FIGURES
+    assert images(folder) == FIGURES and {name for name in FIGURES if f"]({name}.png)" in target} == FIGURES
     html = read_page((folder / "results.html").read_text())
     inlined = [b64decode((image["src"] or "").partition("base64,")[2]) for image in html.attributes("img")]
     assert sorted(inlined) == sorted(path.read_bytes() for path in folder.glob("*.png"))
@@ -99,8 +98,7 @@ def test_the_table_of_methods_has_the_targets_column_first(target: str) -> None:
     assert (astra["success in the target"], astra["in its simulator"]) == ("0.50 ± 0.25", "0.75 ± 0.00")
     assert (astra["lost"], astra["failed"], astra["seeds"]) == ("0.25", "0.50 ± 0.25", "3")
     assert plus["path length to success (m)"] == "8.0 ± 0.0"
-    assert table["Careful follower (ceiling)"]["in its simulator"] == "-"
-    assert "Direct transfer (floor)" in table
+    assert table["Careful follower (ceiling)"]["in its simulator"] == "-" and "Direct transfer (floor)" in table
 
 
 def test_a_finished_report_is_current_until_something_changes(root: Path) -> None:
@@ -172,8 +170,7 @@ def test_publishing_adds_to_what_is_there(
     assert found.values("astra_plus", "success") == {0: 1.0, 1: 0.75}
     # The trajectories of ASTRA+ are not here: the figure stays as it is.
     page = (folder / "antmaze_u.md").read_text()
-    assert "](antmaze_u_trajectories.png)" in page
-    assert (folder / "antmaze_u_trajectories.png").read_bytes() == drawn
+    assert "](antmaze_u_trajectories.png)" in page and (folder / "antmaze_u_trajectories.png").read_bytes() == drawn
     assert not caplog.records
     # A changed result replaces the earlier one, and it is said.
     edit_json(root / "evaluate/astra/seed_2/evaluation.json", target=outcomes([0, 0, 0, 0], 2))
@@ -221,8 +218,7 @@ def test_sizes_are_set_side_by_side(rough: None, tmp_path: Path, monkeypatch: py
     head, direct, astra = html.table("Success in the target, mean")
     assert (head, astra) == (["method", "50 %", "100 %"], ["ASTRA", "0.25 ± 0.25", "0.50 ± 0.25"])
     assert direct == ["Direct transfer", "-", "0.12 ± 0.18 (2 of 3 seeds)"]
-    assert "Not finished yet: Direct transfer at 50 %." in html.text
-    assert "data_efficiency" in images(root / "report")
+    assert "Not finished yet: Direct transfer at 50 %." in html.text and "data_efficiency" in images(root / "report")
     assert (tmp_path / "results/sizes_data_efficiency.png").exists()
 
 

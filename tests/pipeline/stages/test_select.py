@@ -66,8 +66,7 @@ def test_who_judges_whom_with_what_drawn_where(root: Path, monkeypatch: pytest.M
     found = judged(root, episodes=7)
     assert {episodes for _, episodes, _ in asked} == {7}
     # In the order of rows, seeds and judges; rows of one seed meet the same starts and goals.
-    assert found.candidates[0].success == {1: 0.01, 2: 0.02}
-    assert found.candidates[5].success == {0: 0.11, 1: 0.12}
+    assert found.candidates[0].success == {1: 0.01, 2: 0.02} and found.candidates[5].success == {0: 0.11, 1: 0.12}
     drawn = [seed for *_, seed in asked]
     assert drawn[:6] == drawn[6:] and len(set(drawn)) == 6
     latents = [policy.source_encoder is not None for policy, *_ in asked]

@@ -170,8 +170,7 @@ def test_rma_goes_on_after_an_interruption_in_either_phase(
         make(task, "rma", paired, None, out, progress=stop_past(share))
     seen: list[float] = []
     resumed = make(task, "rma", paired, None, out, progress=lambda done, note: seen.append(done))
-    assert seen == pytest.approx([tenth / 10 for tenth in range(5 if share < 0.6 else 9, 11)])
-    assert resumed == expected
+    assert seen == pytest.approx([tenth / 10 for tenth in range(5 if share < 0.6 else 9, 11)]) and resumed == expected
 
 
 def test_methods_that_do_not_fit_are_refused(task: str, paired: Path, tmp_path: Path) -> None:

@@ -71,8 +71,7 @@ def test_equals_gymnasiums_humanoid_step_for_step(scale: float) -> None:
         observation, reward, terminated, _, _ = env.step(control[1])
         found = np.concatenate([ours.physics.qpos[1, 2:], ours.physics.qvel[1]])
         np.testing.assert_allclose(found, observation[:45], rtol=0, atol=1e-9)
-        assert float(step.reward[1]) == pytest.approx(reward, rel=1e-6)
-        assert bool(step.terminated[1]) == terminated
+        assert float(step.reward[1]) == pytest.approx(reward, rel=1e-6) and bool(step.terminated[1]) == terminated
         ended |= terminated
     assert ended  # so that both heights were seen
     env.close()

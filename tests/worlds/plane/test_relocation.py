@@ -46,8 +46,7 @@ def test_only_what_keeps_its_distance_may_move() -> None:
         path.columns[name][:, 1] -= np.where(np.abs(x) < 1.0, 1.5, 0.0)
     (first, second) = relocation().stretches(path)
     assert (first[0], second[1]) == (0, 100) and abs(first[1] - 37) <= 1 and abs(second[0] - 63) <= 1
-    assert relocation(min_steps=40).stretches(path) == []
-    assert relocation(margin_m=0.3).stretches(path) == [(0, 100)]
+    assert relocation(min_steps=40).stretches(path) == [] and relocation(margin_m=0.3).stretches(path) == [(0, 100)]
 
 
 def draws(count: int, episode: Episode, **changes: Any) -> list[Any]:
@@ -93,8 +92,7 @@ def test_an_episode_ends_at_the_goal_or_where_it_topples(toppled_at: int | None,
     judged = outcomes(TASK.objective, before, after, AIM, toppled)
     assert {len(values) for values in judged.values()} == {length}
     assert judged["next.success"].tolist() == [False] * (length - 1) + [success]
-    assert judged["next.terminated"].tolist() == judged["next.done"].tolist()
-    assert not judged["next.truncated"].any()
+    assert judged["next.terminated"].tolist() == judged["next.done"].tolist() and not judged["next.truncated"].any()
     # The last step earns +10 or -10; all of them 0.1 m of progress.
     assert judged["next.reward"][-1] == pytest.approx(10.1 if success else -9.9, abs=0.02)
     assert judged["next.reward"][:-1].mean() == pytest.approx(0.1, abs=0.02)
