@@ -56,9 +56,7 @@ def policies() -> dict[str, RunningPolicy]:
     still = Task(**GIVEN | {"make_simulator": Speed, "objective": Stay(horizon=40)})
     whole = SoftActor(PolicyShape(33, 2, hidden_sizes=(8,)))
     return {
-        "recurrent": RunningPolicy(ANT, actor(8, memory_size=8), command_limit=0.4),
-        "source encoder": RunningPolicy(ANT, actor(16), latent, command_limit=0.4),
-        "target encoder": RunningPolicy(ANT, actor(16, memory_size=8), latent, aligned),
+        "target encoder": RunningPolicy(ANT, actor(16, memory_size=8), latent, aligned, command_limit=0.4),
         "adaptive": RunningPolicy(ANT, lively(Student(rma))),
         "full state": RunningPolicy(ANT, whole, observed="full"),
         "units, no goal": RunningPolicy(still, actor(1, 1, memory_size=4)),

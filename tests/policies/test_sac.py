@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 import torch
 from torch import nn
-from toy_worlds import ConstantReward, EndsAtZero, GoToZero, train, whole_and_resumed
+from toy_worlds import EndsAtZero, GoToZero, whole_and_resumed
 
 from astra_data.policies import sac as module
 from astra_data.policies.networks import PolicyShape, SoftActor, features_of
@@ -46,26 +46,6 @@ def test_where_the_episodes_cannot_go_on_its_replay_does_not_either() -> None:
     again.load_state_dict(learner.state_dict(), again.env.reset(), goes_on=False)
     kept, cut = (torch.as_tensor(one.state_dict()["replay"]["expired"]) for one in (learner, again))
     assert torch.equal(cut[:-1], kept[:-1]) and cut[-1].all() and not kept[-1].any()
-
-
-@pytest.mark.parametrize(
-    ("terminates_after", "memory", "expected"), [(math.inf, 0, 10.0), (math.inf, 8, 10.0), (10.0, 0, 5.26)]
-)
-def test_running_out_of_time_bootstraps_and_ending_does_not(
-    terminates_after: float, memory: int, expected: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """One unit each step is worth 1 / (1 - 0.9) = 10; where a tenth of like steps are the last, 1 / 0.19."""
-    for name, value in {"_TARGET_RATE": 0.2, "_INITIAL_TEMPERATURE": 1e-6, "_REWARD_SCALE": 1.0}.items():
-        monkeypatch.setattr(module, name, value)
-    horizon = 10 if terminates_after > 10 else 1000
-    env = ConstantReward(16, terminates_after)
-    learner = sac(*(env, 100), horizon=horizon, memory=memory, window=4, burn_in=1, learning_rate=5e-3)
-    train(learner)
-    begun = torch.ones(1, 1, 1), torch.zeros(1, 1, 1), torch.ones(1, 1)
-    with torch.no_grad():
-        features = learner._critics.features(*begun)[:, 0]
-        value = float(learner._critics(features, torch.zeros(1, 1))[0])
-    assert value == pytest.approx(expected, rel=0.12)
 
 
 @pytest.mark.parametrize("memory", [0, 8])
@@ -137,6 +117,8 @@ def test_an_update_is_that_of_the_printed_losses(memory: int, monkeypatch: pytes
         beyond = action_values(slow, late[:, 1:][learned], following).amin(0) - temperature * log_prob
         over, reward = steps["terminated"][:, :-1][learned], steps["reward"][:, :-1][learned]
         assert over.any() and not over.all()
+        expired = steps["first"][:, 1:] & ~steps["terminated"][:, :-1]
+        assert expired.any() and not (learned & expired).any()
         within = learned & ~steps["first"][:, 1:]
         shown = steps["observation"][:, 1:, 0][within]
         torch.testing.assert_close(steps["reward"][:, :-1][within], -3.0 * shown.square())
