@@ -99,8 +99,7 @@ def _table(values: Mapping[str, Any]) -> str:
 
 
 DESCRIPTION, LOOP, PAGE = "policy.json", "run_policy.py", "README.md"
-FORMAT = 1
-"""Of `DESCRIPTION`."""
+FORMAT = 1  # of `DESCRIPTION`
 
 
 def deploy(run: Path, row: str, out: Path, *, seed: int = 0, percent: int | None = None) -> Path:
@@ -163,8 +162,7 @@ def _values(column: Column, called: str) -> dict[str, Any]:
     return {"column": column.name, "names": list(names), **kept}
 
 
-TYPE = "astra_data"
-"""The name under which LeRobot knows the policy and the environment."""
+TYPE = "astra_data"  # the name under which LeRobot knows the policy and the environment
 
 
 def write_lerobot_files(about: Mapping[str, Any], folder: Path) -> None:

@@ -23,8 +23,7 @@ TOLERANCE = 1e-3
 """How far commands of the graph may be from those of the policy, in half ranges: more than rounding does."""
 
 _COMPARED_STEPS = 100
-_MOST_DRAWS = 100
-"""Of a state for which the policy has a command."""
+_MOST_DRAWS = 100  # of a state for which the policy has a command
 
 Graph = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
 

@@ -9,8 +9,7 @@ from torch import Tensor, nn
 from astra_data.core.arrays import normalized
 from astra_data.grounding.encoder import ENCODERS, HistoryEncoder, PositionFeatures, take_scales
 
-LEAST_LATENT_R2 = 0.9
-"""Of a target encoder on held-out episodes, to be deployed in place of the source encoder."""
+LEAST_LATENT_R2 = 0.9  # of a target encoder on held-out episodes, to be deployed in place of the source encoder
 
 
 class TargetEncoder(nn.Module):

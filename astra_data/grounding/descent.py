@@ -68,10 +68,8 @@ class WindowedConfig(Config):
 
 
 _PASSES, _UPDATES = 32, (600, 1200)
-_GRADIENT_NORM = 1.0
-"""Gradients are clipped to this norm."""
-_PATIENCE_SHARE = 0.3
-"""A fit ends once its held-out error has not fallen for this share of the updates."""
+_GRADIENT_NORM = 1.0  # gradients are clipped to this norm
+_PATIENCE_SHARE = 0.3  # a fit ends once its held-out error has not fallen for this share of the updates
 
 
 class Descent:

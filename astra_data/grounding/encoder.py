@@ -10,8 +10,7 @@ from torch import Tensor, nn
 from torch.autograd.function import FunctionCtx
 from torch.nn import functional
 
-_LONGEST_M = 16.0
-"""Longest wavelength of position features."""
+_LONGEST_M = 16.0  # longest wavelength of position features
 
 
 def mlp(sizes: tuple[int, ...], activation: type[nn.ELU | nn.ReLU] = nn.ELU, *, inplace: bool = False) -> nn.Sequential:
@@ -76,8 +75,7 @@ class Encoder(nn.Module, ABC):
 
     """
 
-    kind: ClassVar[str]
-    """Names the class in files, see `ENCODERS`."""
+    kind: ClassVar[str]  # names the class in files, see `ENCODERS`
     latent_size: int
 
     def __init__(self, input_size: int, *, embedding_size: int, latent_size: int) -> None:
@@ -228,8 +226,7 @@ class LatentEncoder(Protocol):
         ...
 
 
-_LEAST = 1e-3
-"""Lower bound of a deviation."""
+_LEAST = 1e-3  # lower bound of a deviation
 
 
 def take_scales(network: nn.Module, values: Mapping[str, Tensor]) -> None:

@@ -26,15 +26,13 @@ from astra_data.grounding.paired_episodes import RISK_STEPS, PairedEpisodes, Pai
 from astra_data.grounding.simulator import Grounding
 from astra_data.worlds.task import Task
 
-AVERAGED_S = (0.25, 0.5, 1.0)
-"""Time constants of the averages of the magnitudes, beside their present values."""
+AVERAGED_S = (0.25, 0.5, 1.0)  # time constants of the averages of the magnitudes, beside their present values
 AHEAD_S = (0.25, 0.5, 1.0, 1.5, 2.0)
 """How far ahead walls are looked for, both as the robot moves and as the simulator does."""
 FAILURE_STEPS = 2
 """Steps within which failures are predicted: of 2, 5, 10 and 20 the one with the highest likelihood of the
 moments of failures on a cart, an ant and a NAO."""
-_FARTHEST_M = 3.0
-"""Walls farther away than this are alike."""
+_FARTHEST_M = 3.0  # walls farther away than this are alike
 _MAGNITUDES = 5
 _AVERAGES = len(AVERAGED_S) * _MAGNITUDES
 
@@ -195,17 +193,14 @@ def calibration(odds: Tensor, fails: Tensor, risk_steps: int) -> tuple[Tensor, T
     return scale.detach().exp(), shift.detach()
 
 
-AHEAD_STEPS = ((1, 20), (11, 30), (21, 40))
-"""Windows before a failure, in steps, in which it is to be foreseen."""
+AHEAD_STEPS = ((1, 20), (11, 30), (21, 40))  # windows before a failure, in steps, in which it is to be foreseen
 _REPLAYED = 3 * RISK_STEPS
 """Steps of a replay: the last of them come after as long as the averages of a failure model remember."""
 _BATCH = 512
-_FAILING_SHARE = 0.25
-"""Of each batch: steps that fail soon are too rare to be drawn as often as they come."""
+_FAILING_SHARE = 0.25  # of each batch: steps that fail soon are too rare to be drawn as often as they come
 _WEIGHT_DECAY = 1.0
 _DESCENT = DescentConfig(updates=200, learning_rate=3e-3)
-BINS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
-"""Edges of the probabilities in a reliability diagram."""
+BINS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # edges of the probabilities in a reliability diagram
 
 
 def failing(task: Task, episodes: PairedEpisodes, risk_steps: int = FAILURE_STEPS) -> PairedEpisodes:

@@ -202,8 +202,7 @@ def _held_out_error(model: GroundingModel, episodes: PairedEpisodes, weights: Lo
     return float(loss)
 
 
-_CLOSEST_SHARE = 0.01
-"""Of the recorded steps: those that were closer to a wall are not what a robot can rely on."""
+_CLOSEST_SHARE = 0.01  # of the recorded steps: those that were closer to a wall are not what a robot can rely on
 
 
 def recorded_clearance_m(task: Task, episodes: PairedEpisodes) -> float | None:

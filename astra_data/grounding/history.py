@@ -137,8 +137,7 @@ class HistoryGrounding(FittedGrounding):
     failures: FailureModel | None = None
     clearance_m: float | None = None
     """How close to walls corrections may end; None for as close as the simulator itself."""
-    scatter_model: ScatterModel | None = None
-    """Of the target around the correction, if one was fitted."""
+    scatter_model: ScatterModel | None = None  # of the target around the correction, if one was fitted
     fails_at_walls: bool = False
     """Whether touching a wall is a failure. Then the correction touches it, not the scatter, which holds the
     errors of where the robot was believed to be."""

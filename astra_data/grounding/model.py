@@ -14,10 +14,8 @@ from astra_data.core.errors import BadInputError
 from astra_data.grounding.encoder import ENCODERS, HistoryEncoder, PositionFeatures, mlp
 from astra_data.grounding.paired_episodes import PairedEpisodes, PairedWindows
 
-_BALL_M = 0.1
-"""Unit of the ball's position relative to the robot: less than this decides whether they touch."""
-_EMA_RATE = 0.01
-"""By how much the target encoder follows the encoder in each update."""
+_BALL_M = 0.1  # unit of the ball's position relative to the robot: less than this decides whether they touch
+_EMA_RATE = 0.01  # by how much the target encoder follows the encoder in each update
 
 
 @dataclass(frozen=True)

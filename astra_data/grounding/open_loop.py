@@ -15,8 +15,7 @@ from astra_data.grounding.simulator import NO_GROUNDING, EpisodeSimulator, Groun
 from astra_data.worlds.task import Task
 
 HORIZONS = (1, 10, 50, 200)
-_START_EVERY = 25
-"""Steps of an episode for each replay; one start is drawn from each part of this length."""
+_START_EVERY = 25  # steps of an episode for each replay; one start is drawn from each part of this length
 
 
 def distances(task: Task, error: Tensor) -> Tensor:

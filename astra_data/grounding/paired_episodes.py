@@ -32,8 +32,7 @@ from astra_data.dataset.versions import open_dataset
 from astra_data.worlds.commands import Commands
 from astra_data.worlds.task import Task
 
-RISK_STEPS = 20
-"""Steps before each failure that `PairedWindows.fails_soon` marks."""
+RISK_STEPS = 20  # steps before each failure that `PairedWindows.fails_soon` marks
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,7 @@ from astra_data.grounding.encoder import mlp
 from astra_data.grounding.model import GroundingModel
 from astra_data.grounding.paired_episodes import PairedEpisodes
 
-_MOST = 2.0
-"""Of the logarithm of a scale: off the data no moment shall scatter by more than e² times the usual."""
+_MOST = 2.0  # of the logarithm of a scale: off the data no moment shall scatter by more than e² times the usual
 
 
 @dataclass(frozen=True)

@@ -19,10 +19,8 @@ class EpisodeSimulator:
     The parameters of a `VariedSimulator` are redrawn for each episode.
     """
 
-    latent_size: int = 0
-    """Z, of the latents that policies observe; 0 where there are none."""
-    landed: Tensor
-    """Where the simulator landed in the last step, before any correction, (B, X)."""
+    latent_size: int = 0  # Z, of the latents that policies observe; 0 where there are none
+    landed: Tensor  # where the simulator landed in the last step, before any correction, (B, X)
 
     def __init__(self, simulator: PlacedSimulator) -> None:
         """Wrap `simulator`."""
@@ -119,8 +117,7 @@ def _remembering_within(simulator: object) -> RememberingSimulator | None:
 class Grounding(Protocol):
     """How an abstract simulator is corrected, if it is."""
 
-    start_stride: ClassVar[int] = 1
-    """Recorded steps between those that episodes may start from."""
+    start_stride: ClassVar[int] = 1  # recorded steps between those that episodes may start from
 
     @property
     def encoder(self) -> LatentEncoder | None:
@@ -154,8 +151,7 @@ class Grounding(Protocol):
 class FittedGrounding(Grounding, Protocol):
     """A grounding that was fitted to pairs, and can be saved."""
 
-    kind: ClassVar[str]
-    """Names the class in files; see `files.KINDS`."""
+    kind: ClassVar[str]  # names the class in files; see `files.KINDS`
 
     def to_file(self) -> tuple[Mapping[str, Tensor], dict[str, Any]]:
         """Return tensors, at least one, and metadata (JSON values) from which `from_file` rebuilds it."""

@@ -68,8 +68,7 @@ class SeededSimulatorEnv:
         return step
 
 
-SeededEnv = TargetEnv | SeededSimulatorEnv
-"""A batched environment with its own randomness."""
+SeededEnv = TargetEnv | SeededSimulatorEnv  # a batched environment with its own randomness
 
 
 class SingleEnv(gymnasium.Env[Array, Array]):

@@ -63,8 +63,7 @@ class Policy(nn.Module, ABC):
     The memory is an argument and a result, `hidden` (B, M), never kept; without memory M = 0.
     """
 
-    squashes: ClassVar[bool] = False
-    """Whether actions are the tanh of draws from the Gaussian that `policy` returns."""
+    squashes: ClassVar[bool] = False  # whether actions are the tanh of draws from the Gaussian that `policy` returns
 
     def __init__(self, shape: PolicyShape) -> None:
         super().__init__()

@@ -44,8 +44,7 @@ class ActingPolicy(Protocol):
 class SavedPolicy(ActingPolicy, Protocol):
     """What a policy has to have that a learner of the user's makes for a row."""
 
-    kind: ClassVar[str]
-    """Names the class in files; see `KINDS`."""
+    kind: ClassVar[str]  # names the class in files; see `KINDS`
 
     def to_file(self) -> tuple[Mapping[str, Tensor], dict[str, Any]]:
         """Return tensors, at least one, and metadata (JSON values) from which `from_file` rebuilds it."""

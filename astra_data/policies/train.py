@@ -126,8 +126,7 @@ Learn = Callable[[Training], tuple[PolicyFile, dict[str, Any]]]  # returns the p
 class ResumableEnv(BatchedEnv, Protocol):
     """A batched environment in which a training can be resumed."""
 
-    penalty_scale: float
-    """Factor on penalties in the reward, which the training ramps up."""
+    penalty_scale: float  # factor on penalties in the reward, which the training ramps up
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return all that `load_state_dict` needs to continue from here."""
@@ -142,8 +141,7 @@ class ResumableEnv(BatchedEnv, Protocol):
 class InSimulator:
     """Train in the abstract simulator."""
 
-    reward: RewardSource = "abstract"
-    """Where the reward comes from, but for the plus settings."""
+    reward: RewardSource = "abstract"  # where the reward comes from, but for the plus settings
     ranges: Literal["randomized", "wide"] | None = None
     """Which of the task's ranges the simulator's parameters are drawn from, unless the grounding has ranges or
     the method's own settings are ranges; None where they stay plain."""
@@ -256,8 +254,7 @@ class TargetConfig(Config):
 class InTarget:
     """Train in the target, from its own rewards."""
 
-    observed: Observed
-    """Whether the policy observes φ of the state or the full state."""
+    observed: Observed  # whether the policy observes φ of the state or the full state
 
     def __call__(self, training: Training) -> tuple[PolicyFile, dict[str, Any]]:
         """Return the policy and its learning curve."""
@@ -332,8 +329,7 @@ class UserLearner(InSimulator):
     learn: Callable[["WatchedEnv", Training], SavedPolicy]
     """Given the environment, a vector environment of Gymnasium, and the training, which has the recipe's settings
     (`training.config.total_steps`) and the seed, returns the policy. A hand-written one needs no step."""
-    policy: type[SavedPolicy]
-    """The class of what it returns."""
+    policy: type[SavedPolicy]  # the class of what it returns
 
     def __call__(self, training: Training) -> tuple[PolicyFile, dict[str, Any]]:
         """Return the policy and its learning curve."""
