@@ -1,10 +1,12 @@
 """New versions of a dataset with other episodes: subset, delete, filter and merge; nothing is edited in place."""
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from astra_data.core.config import did_you_mean, only_given
 from astra_data.core.errors import BadInputError
@@ -81,13 +83,10 @@ def share(percent: int, episodes: int) -> int:
 
 def check_uids(dataset: Dataset, uids: Sequence[int]) -> None:
     """Raise a BadInputError unless `dataset` has the episodes `uids`."""
-    known = _uids(dataset)
+    known = sorted(_uids(dataset))
     if unknown := sorted(set(uids) - set(known)):
-        raise BadInputError(
-            f"{dataset.reference} has no episode {first_few(unknown, MOST_UIDS)}; "
-            f"its {len(dataset)} uids lie between {min(known)} and {max(known)}: "
-            f"{first_few(sorted(known), MOST_UIDS)}"
-        )
+        its = f"its {len(dataset)} uids lie between {known[0]} and {known[-1]}: {first_few(known, MOST_UIDS)}"
+        raise BadInputError(f"{dataset.reference} has no episode {first_few(unknown, MOST_UIDS)}; {its}")
 
 
 def delete(source: Dataset, uids: Sequence[int], *, name: str | None = None, out: Path | None = None) -> Path:
@@ -115,15 +114,13 @@ def filter_episodes(
     config = only_given(**given, min_length=min_length, max_length=max_length)
     if not config:
         raise BadInputError("a filter needs a condition: on success, return or length")
-    kept = set(_uids(source))
-    bounds = {"success": (success, success), "return": (min_return, max_return)}
-    for key, (low, high) in (bounds | {"length": (min_length, max_length)}).items():
+    kept, uids = set(_uids(source)), _uids(source)
+    bounds = {"success": (success, success), "return": (min_return, max_return), "length": (min_length, max_length)}
+    for key, (low, high) in bounds.items():
         if (low, high) != (None, None):
-            kept &= {
-                uid
-                for uid, value in zip(_uids(source), _facts(source, key), strict=True)
-                if isinstance(value, int | float) and (low is None or value >= low) and (high is None or value <= high)
-            }
+            least, most = -np.inf if low is None else low, np.inf if high is None else high
+            facts = zip(uids, _facts(source, key), strict=True)
+            kept &= {uid for uid, fact in facts if isinstance(fact, int | float) and least <= fact <= most}
     return _write(source, kept, stage="filter", config=config, name=name, out=out)
 
 
@@ -173,19 +170,11 @@ def merge(
     return writer.root
 
 
-def _write(
-    source: Dataset,
-    kept: set[int],
-    *,
-    stage: str,
-    config: Mapping[str, Any],
-    name: str | None,
-    out: Path | None,
-    seed: int | None = None,
-) -> Path:
+def _write(source: Dataset, kept: set[int], *, seed: int | None = None, **described: Any) -> Path:
+    """Write the episodes `kept` as the next version, `described` as `next_version` takes it."""
     if not kept:
         raise BadInputError(f"{source.reference}: none of its {len(source)} episodes would be left")
-    with next_version(source, "episodes", stage=stage, config=config, name=name, out=out, subset_seed=seed) as writer:
+    with next_version(source, "episodes", subset_seed=seed, **described) as writer:
         chosen = [index for index, uid in enumerate(_uids(source)) if uid in kept]
         for episode in source.episodes(episodes=chosen):
             writer.add(episode)

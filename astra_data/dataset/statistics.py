@@ -92,15 +92,11 @@ class EpisodeRows:
     """Writes meta/episodes, one row per `append`."""
 
     def __init__(self, root: Path, columns: list[Column], task: str) -> None:
-        """Start for a dataset in `root` with the stored `columns` and one `task`."""
-        self._columns = columns
-        self._task = task
-        self._schema = episodes_schema(columns)
+        self._columns, self._task, self._schema = columns, task, episodes_schema(columns)
         self._writer = RotatingWriter(root, EPISODES_PATH, self._schema)
         self._rows: list[tuple[int, int, int]] = []
         self._statistics: list[NDArray[np.float64]] = []
-        self._episodes = 0
-        self._frames = 0
+        self._episodes = self._frames = 0
 
     def append(self, length: int, chunk: int, file: int, statistics: NDArray[np.float64]) -> None:
         """Append an episode of `length` steps in data file `file` of `chunk`; `statistics` (9, sum of sizes)."""
@@ -152,7 +148,6 @@ class Rounding:
     """Compares the steps of a column's values (n, size) with those that float32 holds."""
 
     def __init__(self, column: Column, offset: Sequence[float] = ()) -> None:
-        """Compare those of `column`, to which `offset` was added."""
         self._column, self._offset = column, offset
         self._low, self._high = np.full(column.size, np.inf), np.full(column.size, -np.inf)
         self._samples: list[Array] = []

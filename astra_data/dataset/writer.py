@@ -129,7 +129,6 @@ class DatasetWriter:
             stack.callback(self._data.abandon)
             self._rows = EpisodeRows(self._folder, self._stored, self._task)
             stack.callback(self._rows.abandon)
-            stack.push(self._finish)
             self._exit = stack.pop_all()
         self._is_open = True
         return self
@@ -139,7 +138,11 @@ class DatasetWriter:
     ) -> None:
         """Commit, or after an error remove the hidden folder."""
         self._is_open = False
-        self._exit.__exit__(kind, error, trace)
+        if error is not None:
+            self._exit.__exit__(kind, error, trace)
+            return
+        with self._exit:
+            self._finish()
 
     def add(self, episode: Episode) -> None:
         """Append `episode`; a refused one changes nothing.
@@ -166,12 +169,8 @@ class DatasetWriter:
         self._lengths[episode.uid] = length
         self._metadata.append(episode.metadata)
 
-    def _finish(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Unless there was an error, close the data files, write all other files and verify."""
-        if error is not None:
-            return
+    def _finish(self) -> None:
+        """Close the data files, write all other files and verify."""
         self._data.close()
         self._rows.close()
         if not self._lengths:

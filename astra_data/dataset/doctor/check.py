@@ -156,15 +156,14 @@ def _files_are_readable(root: Path, info: Mapping[str, Any], columns: list[plain
         if not files:
             report.fault("files", f"{kind} has no parquet file")
         for path in files:
-            name = path.relative_to(root)
-            footer = plain.read_footer(path)
+            name, footer = path.relative_to(root), plain.read_footer(path)
             if isinstance(footer, str):
                 report.fault("files", f"{name} {footer}")
             elif kind == "data":
                 rows += footer[0]
                 unknown = sorted(set(footer[1].names) - info["features"].keys())
-                faults = plain.schema_faults(footer[1], columns)
-                for fault in [*faults, *(f"has an unknown column {column}" for column in unknown)]:
+                faults = [f"has an unknown column {column}" for column in unknown]
+                for fault in plain.schema_faults(footer[1], columns) + faults:
                     report.fault("columns", f"{name} {fault}")
     if not isinstance(total := info.get("total_frames"), int) or rows < total:
         for missing in plain.missing_files(root, plain.read_places(root, info)[0]):

@@ -68,11 +68,6 @@ def repair(
             out, or, with `new_uids`, has no metadata.
         new_uids: give an episode whose uid an earlier one has a new one, the same in every run, and keep the
             old one as "merged_uid"; otherwise it is left out.
-
-    Raises:
-        CorruptDatasetError: meta/info.json is missing, or no episode is intact.
-        BadInputError: there is no `folder`, it is a run or holds versions of a dataset, `out` exists, or
-            episodes cannot be joined with `like`.
     """
     if not folder.is_dir():
         raise BadInputError(f"{folder}: expected the folder of a dataset, got no folder")

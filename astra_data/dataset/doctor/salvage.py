@@ -45,13 +45,14 @@ def whole_runs(
     An episode after rows that are lost is known by its own number and rows, where they agree with meta/episodes or,
     without that, where both are greater than those that should follow.
     """
-    info = plain.read_object(folder / INFO_PATH)
-    places, faults = plain.read_places(folder, info if isinstance(info, dict) else {})
+    found = plain.read_object(folder / INFO_PATH)
+    info = found if isinstance(found, dict) else {}
+    places, faults = plain.read_places(folder, info)
     notes += [f"meta/episodes was rebuilt from the data: {fault}" for fault in faults]
     if not places and not faults:
         notes.append("meta/episodes was missing and was rebuilt from the data")
     notes += [f"{name} is missing" for name in plain.missing_files(folder, places)]
-    counted = info.get("total_episodes") if isinstance(info, dict) else None
+    counted = info.get("total_episodes")
     most = len(next(iter(digests.values()))) if digests else counted if isinstance(counted, int) else 2**31
     episode = row = 0
     uids: set[int] = set()
