@@ -21,16 +21,9 @@ class Balance(Objective):
     """Keep a number small: as little as an objective can be."""
 
     action_size = 1
-    goal_size = 0
 
     def draw_starts(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
         return rng.normal(size=(count, 1))
-
-    def draw_goals(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
-        return np.empty((count, 0))
-
-    def observe(self, state: Tensor, goal: Tensor) -> Tensor:
-        return state
 
     def reached(self, state: Tensor, goal: Tensor) -> Tensor:
         return state[:, 0] == 0

@@ -172,27 +172,6 @@ def test_a_robot_that_leans_by_over_45_degrees_any_way_has_fallen(axis: int, deg
     assert bool(robots.fallen[0]) == fallen
 
 
-EVERYONE = np.arange(3)
-
-
-def commands(steps: int, robots: int) -> Floats:
-    drawn = np.random.default_rng(1).uniform(-1, 1, (steps, robots, 3))
-    return np.asarray(drawn * [0.2, 0.15, 1.0])
-
-
-def walk(nao: BatchedNao, steps: int) -> Floats:
-    for command in commands(steps, nao.num_robots):
-        nao.step(command)
-    return nao.bodies.state.copy()
-
-
-def test_the_same_seed_gives_the_same_bytes_on_any_number_of_threads() -> None:
-    first = walk(BatchedNao(5, seed=3, num_threads=1), 8)
-    assert first.tobytes() == walk(BatchedNao(5, seed=3, num_threads=1), 8).tobytes()
-    assert first.tobytes() == walk(BatchedNao(5, seed=3, num_threads=3), 8).tobytes()
-    assert first.tobytes() != walk(BatchedNao(5, seed=4, num_threads=1), 8).tobytes()
-
-
 @pytest.mark.parametrize(
     "command", [(0.2, 0.0, 0.0), (-0.12, 0.0, 0.0), (0.0, 0.15, 0.0), (0.0, -0.15, 0.0), (0.0, 0.0, 0.8)]
 )
