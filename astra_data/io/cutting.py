@@ -105,12 +105,7 @@ class Cutter:
         self._has_rows = self._was_torn = self._ended = False
 
     def feed(self, block: Block, *, is_apart: bool) -> Iterator[Cut]:
-        """Add `block`; yield the columns and the metadata of episodes that ended.
-
-        Args:
-            block: at least one row.
-            is_apart: whether it begins a new file instead of continuing the block before.
-        """
+        """Add `block`, which begins a new file if it `is_apart`; yield the columns and metadata of ended episodes."""
         if is_apart or block.starts:
             yield from self.cut()
             self._begins = "file" if is_apart else "back" if block.is_back else "source"
@@ -146,7 +141,21 @@ class Cutter:
         table = {key: np.concatenate([each[key] for each in self._tables]) for key in self._tables[0]}
         self._tables = []
         [kept] = np.nonzero(table["/finite"])
-        masks, steps_s = self._boundaries(table)
+        n = len(table["/row"])
+        masks: dict[str, Array] = {reason: np.zeros(n, bool) for reason in REASONS}
+        masks["end"][1:] = table["/end"][:-1]
+        earlier, later = table["/field"][:-1], table["/field"][1:]
+        # What is missing (NaN) is the same value again, as empty cells of CSV are.
+        masks["field"][1:] = ((earlier != later) & ~((earlier != earlier) & (later != later))).any(axis=1)
+        times = np.repeat(table["/time"][:, None], 3, axis=1)
+        times[~table["/finite"] & (self._mapping.not_finite == "drop"), 2] = np.nan
+        known = np.where(np.isfinite(times[:, 1:]), np.arange(n)[:, None], 0)
+        times[:, 1:] = np.take_along_axis(times[:, 1:], np.maximum.accumulate(known), axis=0)
+        # As recorded, held over rows without a time, and held over rows that are dropped, too.
+        steps_s = np.diff(times, axis=0, prepend=np.full((1, 3), np.nan))
+        masks["back"] = steps_s[:, 1] < 0
+        masks["gap"] = np.asarray((steps_s[:, 1:] > (self._mapping.split.gap_s or np.inf)).any(axis=1))
+        masks["rejected"] = table["/torn"] | (~table["/finite"] & (self._mapping.not_finite == "split"))
         self._count_time(table, steps_s)
         if not len(kept):
             return
@@ -162,7 +171,7 @@ class Cutter:
             self.tally.split_points[name] = self.tally.split_points.get(name, 0) + 1
         starts = [0, *begins[begins > 0].tolist()]
         # A rejected row is of the episode after it or else before it, by all reasons but rejected rows.
-        rows, apart = np.arange(len(table["/row"])), counts[:-1].sum(axis=0)
+        rows, apart = np.arange(n), counts[:-1].sum(axis=0)
         before = np.searchsorted(kept, rows, side="right") - 1
         after = np.minimum(np.searchsorted(kept, rows), len(kept) - 1)
         is_of_next = (before < 0) | (apart[kept[after]] == apart)
@@ -183,27 +192,6 @@ class Cutter:
             values = {column.name: table[column.name][part] for column in self.columns if column.name in table}
             source = {"source": self._parts[table["/part"][part[0]]].origin}
             yield from self._episode(values, source | {"source_row": int(table["/row"][part[0]])})
-
-    def _boundaries(self, table: Table) -> tuple[dict[str, Array], Array]:
-        """Return to which rows each reason applies, but for jumps, and the steps in time to them.
-
-        The steps (n, 3) are as recorded, held over rows without a time, and over rows that are dropped, too.
-        """
-        n = len(table["/row"])
-        masks: dict[str, Array] = {reason: np.zeros(n, bool) for reason in REASONS}
-        masks["end"][1:] = table["/end"][:-1]
-        earlier, later = table["/field"][:-1], table["/field"][1:]
-        # What is missing (NaN) is the same value again, as empty cells of CSV are.
-        masks["field"][1:] = ((earlier != later) & ~((earlier != earlier) & (later != later))).any(axis=1)
-        times = np.repeat(table["/time"][:, None], 3, axis=1)
-        times[~table["/finite"] & (self._mapping.not_finite == "drop"), 2] = np.nan
-        known = np.where(np.isfinite(times[:, 1:]), np.arange(n)[:, None], 0)
-        times[:, 1:] = np.take_along_axis(times[:, 1:], np.maximum.accumulate(known), axis=0)
-        steps_s = np.diff(times, axis=0, prepend=np.full((1, 3), np.nan))
-        masks["back"] = steps_s[:, 1] < 0
-        masks["gap"] = np.asarray((steps_s[:, 1:] > (self._mapping.split.gap_s or np.inf)).any(axis=1))
-        masks["rejected"] = table["/torn"] | (~table["/finite"] & (self._mapping.not_finite == "split"))
-        return masks, steps_s
 
     def _jumped(self, table: Table, kept: NDArray[np.int64]) -> Mask:
         jump = self._mapping.split.jump
@@ -341,8 +329,14 @@ class Cutter:
             for entry in np.flatnonzero(~finite.all(axis=0)).tolist():
                 source = sources[spec.take[entry] if spec.take else entry]
                 bad[source] = bad.get(source, False) | ~finite[:, entry]
-        if not faults:
-            faults += self._size_faults()
+        sizes = {name: column.size for name, column in self._converted.items()} if not faults else {}
+        if sizes.get(NEXT_STATE) not in (None, sizes.get(STATE)):
+            faults.append(f"{NEXT_STATE} has {sizes[NEXT_STATE]} values, {STATE} {sizes.get(STATE, 0)}")
+        flags = [name for name in (REWARD, *MAPPED_FLAGS) if sizes.get(name, 1) > 1]
+        faults += [f"{name}: {sizes[name]} values, expected 1" for name in flags]
+        if sizes and (jump := self._mapping.split.jump) and max(jump.values) >= (size := sizes[jump.column]):
+            where = f"{jump.column} has {size} values, counted from 0"
+            faults.append(f"split.jump.values {list(jump.values)}: {where}")
         if faults:
             raise BadInputError(f"{block.origin}: {'; '.join(faults)}")
         self.columns = self.columns or _complete(self._converted, self._mapping.terminal)
@@ -354,18 +348,6 @@ class Cutter:
         if lost := [warning for warning, is_lost in found if is_lost]:
             raise BadInputError("; ".join(lost))
         return [warning for warning, _ in found]
-
-    def _size_faults(self) -> list[str]:
-        sizes = {name: column.size for name, column in self._converted.items()}
-        faults = []
-        if sizes.get(NEXT_STATE) not in (None, sizes.get(STATE)):
-            faults.append(f"{NEXT_STATE} has {sizes[NEXT_STATE]} values, {STATE} {sizes.get(STATE, 0)}")
-        flags = [name for name in (REWARD, *MAPPED_FLAGS) if sizes.get(name, 1) > 1]
-        faults += [f"{name}: {sizes[name]} values, expected 1" for name in flags]
-        if (jump := self._mapping.split.jump) and max(jump.values) >= (size := sizes[jump.column]):
-            where = f"{jump.column} has {size} values, counted from 0"
-            faults.append(f"split.jump.values {list(jump.values)}: {where}")
-        return faults
 
 
 def column_of(name: str, spec: ColumnMapping, size: int) -> Column:

@@ -80,11 +80,9 @@ def _robomimic(dataset: Dataset, path: Path, out: Path) -> None:
     observed = {STATE: "obs/state", NEXT_STATE: "next_obs/state", GOAL: "obs/goal"}
     fields = _fields(dataset, ROBOMIMIC | observed)
     environment = dataset.description["environment"]
-    arguments = {
-        "env_name": environment.get("id", dataset.description["name"]),
-        "type": 2,  # gym
-        "env_kwargs": {key: value for key, value in environment.items() if key != "id"},
-    }
+    made_by = {key: value for key, value in environment.items() if key != "id"}
+    name = environment.get("id", dataset.description["name"])
+    arguments = {"env_name": name, "type": 2, "env_kwargs": made_by}  # 2 is gym
     with hdf5_file(path) as file:
         data = file.create_group("data")
         data.attrs["total"] = int(dataset.lengths.sum())
@@ -119,18 +117,23 @@ def _validation(dataset: Dataset) -> NDArray[np.bool_]:
 def _minari(dataset: Dataset, path: Path, out: Path) -> None:
     """Write observations (T + 1, S), a dict where there are goals, actions (T, A), rewards and ends (T,) per episode.
 
-    `minari.create_dataset_from_buffers` would hold all episodes in memory, and not notice a full disk.
+    `minari.create_dataset_from_buffers` would write into Minari's folder alone, and not notice a full disk.
     """
     minari = optional("minari")
     from gymnasium.spaces import Box, Dict  # noqa: PLC0415 - only needed here
+    from minari.dataset.minari_dataset import parse_dataset_id  # noqa: PLC0415 - an extra
     from minari.dataset.minari_storage import MinariStorage  # noqa: PLC0415 - an extra
+    from minari.storage.datasets_root_dir import get_dataset_path  # noqa: PLC0415 - an extra
 
-    identity = _minari_id(out)
-    boxes = {
-        name: Box(-np.inf, np.inf, dataset.features[name]["shape"], np.float32)
-        for name in (STATE, ACTION, GOAL)
-        if name in dataset.features
-    }
+    shelf, place = get_dataset_path().resolve(), out.resolve()
+    identity = str(place.relative_to(shelf)) if place.is_relative_to(shelf) else place.name
+    try:  # its parser raises a TypeError for a name without a version
+        parse_dataset_id(identity)
+    except (ValueError, TypeError) as error:
+        advice = "end --out with a name and a version, such as maze/random-v0"
+        raise BadInputError(f"{out}: '{identity}' is not a Minari id; {advice}") from error
+    known = dataset.features
+    boxes = {n: Box(-np.inf, np.inf, known[n]["shape"], np.float32) for n in (STATE, ACTION, GOAL) if n in known}
     seen: Box | Dict = boxes[STATE]
     observed = {STATE: "observations"}
     if GOAL in boxes:
@@ -146,10 +149,8 @@ def _minari(dataset: Dataset, path: Path, out: Path) -> None:
                 group.attrs["seed"] = seed
             following = values.pop(NEXT_STATE)
             if not np.array_equal(following[:-1], values[STATE][1:]):
-                raise BadInputError(
-                    f"episode {episode.uid}: a next state is not the state of the next step, which Minari "
-                    "cannot store; d4rl and robomimic can"
-                )
+                odd = f"episode {episode.uid}: a next state is not the state of the next step"
+                raise BadInputError(f"{odd}, which Minari cannot store; d4rl and robomimic can")
             values[STATE] = np.concatenate([values[STATE], following[-1:]])
             if GOAL in values:
                 values[GOAL] = np.concatenate([values[GOAL], values[GOAL][-1:]])
@@ -167,29 +168,8 @@ def _minari(dataset: Dataset, path: Path, out: Path) -> None:
     )
 
 
-def _minari_id(out: Path) -> str:
-    """Return the id of a dataset in folder `out`."""
-    from minari.dataset.minari_dataset import parse_dataset_id  # noqa: PLC0415 - an extra
-    from minari.storage.datasets_root_dir import get_dataset_path  # noqa: PLC0415 - an extra
-
-    shelf, place = get_dataset_path().resolve(), out.resolve()
-    name = str(place.relative_to(shelf)) if place.is_relative_to(shelf) else place.name
-    # Its parser raises a TypeError for a name without a version.
-    try:
-        parse_dataset_id(name)
-    except (ValueError, TypeError) as error:
-        raise BadInputError(
-            f"{out}: '{name}' is not a Minari id; end --out with a name and a version, such as maze/random-v0"
-        ) from error
-    return name
-
-
-EXPORTERS: dict[str, Callable[[Dataset, Path, Path], None]] = {
-    "d3rlpy": _d3rlpy,
-    "d4rl": _d4rl,
-    "minari": _minari,
-    "robomimic": _robomimic,
-}  # each writes a dataset to a new path, which is renamed to `out` afterwards
+Exporter = Callable[[Dataset, Path, Path], None]  # writes a dataset to a new path, which is renamed to `out` afterwards
+EXPORTERS: dict[str, Exporter] = {"d3rlpy": _d3rlpy, "d4rl": _d4rl, "minari": _minari, "robomimic": _robomimic}
 
 
 def _fields(dataset: Dataset, standard: dict[str, str]) -> dict[str, str]:

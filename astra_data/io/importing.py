@@ -129,11 +129,6 @@ def import_dataset(
             times the size of the files, or 256 MiB if that is more.
         skip_bad: leave out files and episodes that cannot be imported, which the report and the dataset's
             description list; with a mapping only.
-
-    Raises:
-        BadInputError: a recording is malformed, unpacks to too much or does not fit the mapping; nothing is
-            written.
-        RecipeError: the mapping has faults.
     """
     began = time.perf_counter()
     options = only_given(name=name, fps=fps, task=task, format=file_format)
@@ -200,12 +195,9 @@ def import_dataset(
 
 
 def from_huggingface(table: "datasets.Dataset", mapping: Path | str, *, out: Path | None = None) -> Dataset:
-    """Import the rows of a `datasets.Dataset`, as `import` does those of a Parquet file.
+    """Import the rows of a `datasets.Dataset`, in the order of time, as `import` does those of a Parquet file.
 
-    Args:
-        table: the rows, in the order of time; `[split] field = "episode_index"` of the mapping cuts them.
-        mapping: the file that says which columns become which.
-        out: the dataset's folder, by default its place at home.
+    `[split] field = "episode_index"` of the mapping cuts them.
     """
     with TemporaryDirectory() as folder:
         path = Path(folder) / "rows.parquet"
@@ -270,9 +262,8 @@ def episodes(
                 left_out.append(str(error))
         yield from cutter.cut()
     except MemoryError as error:
-        raise BadInputError(
-            f"an episode does not fit into memory ({in_short(error)}): cut it by [split] in the mapping"
-        ) from error
+        why = f"an episode does not fit into memory ({in_short(error)})"
+        raise BadInputError(f"{why}: cut it by [split] in the mapping") from error
 
 
 @contextmanager

@@ -219,7 +219,6 @@ def read_mapping(path: Path) -> ImportMapping:
     """Read the mapping in the file `path`, or raise a RecipeError with all of its faults."""
     tables = load_tables(path)
     if "columns" not in tables and _OF_RECIPES & tables.keys():
-        raise RecipeError(
-            f"{path} is a recipe: `astra-data run {path}`; expected a mapping, which `astra-data new` writes"
-        )
+        expected = "expected a mapping, which `astra-data new` writes"
+        raise RecipeError(f"{path} is a recipe: `astra-data run {path}`; {expected}")
     return validated(tables, ImportMapping, str(path))

@@ -1,11 +1,8 @@
-"""MCAP files: the messages of some topics as they stand in the file, as far as it goes.
+"""MCAP files: the messages of some topics, up to the last whole record of a file without an end.
 
-A file without an end, as of a recorder that was killed, is read up to its last whole record.
-
-A file is in the order in which its messages were recorded, but for a little: chunks and several publishers.
-Where a topic goes back by more than `split.gap_s`, the clock was set back, and a new stretch begins for all
-topics. Where this is so for over one in `FEWEST` messages, it is no clock: the file is out of order, and
-sorted.
+A file is in the order in which its messages were recorded, but for a little: chunks and several publishers. Where a
+topic goes back by more than `split.gap_s`, the clock was set back, and a new stretch begins for all topics, unless this
+is so for over one in `FEWEST` messages: the file is out of order, and sorted.
 """
 
 import json
@@ -218,10 +215,7 @@ class Timeline:
     def __init__(self, file: McapFile, gap_s: float, pause_s: float) -> None:
         """Find out when messages come, by reading the file once.
 
-        Args:
-            file: has all topics that are wanted.
-            gap_s: by how much a topic may go back while the clock does not.
-            pause_s: what is longer between messages ends an episode in any case.
+        A topic may go back by `gap_s` while the clock does not; `pause_s` between messages ends an episode in any case.
         """
         self._file = file
         times, topics, numbers = array("Q"), array("H"), dict[str, int]()

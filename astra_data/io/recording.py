@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePath, PurePosixPath
-from typing import IO
+from typing import IO, cast
 
 from astra_data.core.config import did_you_mean
 from astra_data.core.durable import file_digest, files_below
@@ -79,10 +79,7 @@ class Source:
         if self.member.size > self.most_unpacked:
             self.refuse_beyond(self.member.size)
         with tarfile.open(self.path) as archive:
-            content = archive.extractfile(self.member)
-            assert content is not None, "find_sources returns plain files"
-            with content:
-                yield content
+            yield cast(IO[bytes], archive.extractfile(self.member))  # find_sources returns plain files
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,11 +139,9 @@ def foreign(names: Sequence[str]) -> str:
             "RLDS (TensorFlow Datasets): load it with tensorflow_datasets, and save each episode's steps by "
             "numpy.savez('0.npz', state=..., action=..., reward=...), then import the folder"
         )
-    for name in names:
-        for endings, advice in FOREIGN.items():
-            if name.lower().endswith(endings) and not is_archive(Path(name)):
-                return f"{PurePosixPath(name).name} is {advice}"
-    return ""
+    plain = [name for name in names if not is_archive(Path(name))]
+    found = ((name, advice) for name in plain for ends, advice in FOREIGN.items() if name.lower().endswith(ends))
+    return next((f"{PurePosixPath(name).name} is {advice}" for name, advice in found), "")
 
 
 def format_of(recordings: Sequence[Path], suffixes: Mapping[str, Sequence[str]]) -> str:
@@ -195,12 +190,8 @@ def find_sources(
 ) -> list[Source]:
     """List the files of recordings in natural order (2 before 10), without hidden ones, named apart.
 
-    Args:
-        recordings: files, folders, or archives, whose members must be plain files inside of them.
-        file_format: of all of them.
-        suffixes: endings of the format's files in a folder or archive, in small letters.
-        mapping: says which files are joined.
-        max_bytes: the most bytes of values that are taken from them, by default in proportion to their sizes.
+    Those in folders and archives end with `suffixes`; archives hold plain files inside of them. `mapping` says which
+    are joined. By default, the `max_bytes` of values that are taken are in proportion to their sizes.
     """
     sources: list[Source] = []
     for recording in recordings:
@@ -331,14 +322,12 @@ def _joined(sources: Sequence[Source], names: Sequence[str]) -> list[Source]:
             if path.name.endswith(name):
                 groups.setdefault((str(path.parent), path.name.removesuffix(name)), {})[name] = source
                 break
-    faults = [
-        f"{folder}/{prefix}{name} is missing, which is joined with {', '.join(map(str, found.values()))}"
-        for (folder, prefix), found in groups.items()
-        for name in names
-        if name not in found
-    ]
-    if faults or not groups:
-        raise BadInputError("; ".join(faults) or f"expected files whose names end with {', '.join(names)}, found none")
+    faults = [] if groups else [f"expected files whose names end with {', '.join(names)}, found none"]
+    for (folder, prefix), found in groups.items():
+        joined = f"which is joined with {', '.join(map(str, found.values()))}"
+        faults += [f"{folder}/{prefix}{name} is missing, {joined}" for name in names if name not in found]
+    if faults:
+        raise BadInputError("; ".join(faults))
     return [replace(found[names[0]], parts=found) for found in groups.values()]
 
 

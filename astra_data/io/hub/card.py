@@ -139,11 +139,9 @@ from datasets import load_dataset
 def _opening(dataset: Dataset) -> str:
     stand_in = dataset.description["environment"].get("stand_in")
     note = f" The robot is a simulated stand-in ({in_code(str(stand_in))}) for a physical one." if stand_in else ""
-    return (
-        f"Version {dataset.description['version']}: {len(dataset):,} episodes, "
-        f"{int(dataset.lengths.sum()):,} steps at {dataset.info['fps']} Hz. "
-        f"Task: “{in_markdown(dataset.task)}”. The format is LeRobot {layout.CODEBASE_VERSION}.{note}"
-    )
+    size = f"{len(dataset):,} episodes, {int(dataset.lengths.sum()):,} steps at {dataset.info['fps']} Hz"
+    task = f"Task: “{in_markdown(dataset.task)}”. The format is LeRobot {layout.CODEBASE_VERSION}."
+    return f"Version {dataset.description['version']}: {size}. {task}{note}"
 
 
 def _counts(dataset: Dataset) -> str:

@@ -63,16 +63,12 @@ def push(
     place = parse_place(destination)
     local = open_dataset(dataset)
     if local.recorded is not None:
-        raise BadInputError(
-            f"{local.root} was recorded by LeRobot: make a dataset of it first, with `astra-data subset "
-            f"{local.root} --percent 100`"
-        )
+        command = f"`astra-data subset {local.root} --percent 100`"
+        raise BadInputError(f"{local.root} was recorded by LeRobot: make a dataset of it first, with {command}")
     written = load_recipe(notes, Notes) if notes else Notes()
     if isinstance(place, UrlStore):
         if private:
-            raise BadInputError(
-                f"{place}: private is for the Hugging Face Hub; elsewhere, set permissions of the storage."
-            )
+            raise BadInputError(f"{place}: private is for the Hugging Face Hub; elsewhere, set permissions there.")
         place = place.below(local.description["name"])
     if faults := check(local.root).faults:
         raise CorruptDatasetError(f"{local.root} was altered: {'; '.join(faults)}. Restore it from a copy.")
@@ -223,10 +219,8 @@ def refuse_planted(folder: Path) -> None:
     for entry in [folder, *folder.rglob("*")]:
         is_plain = entry.is_file() and entry.lstat().st_nlink == 1
         if entry.is_symlink() or not (entry.is_dir() or is_plain):
-            raise SharingError(
-                f"{entry} is a link, a device or a pipe, which no pull leaves there: "
-                f"delete {folder}, then run the same command again."
-            )
+            advice = f"delete {folder}, then run the same command again."
+            raise SharingError(f"{entry} is a link, a device or a pipe, which no pull leaves there: {advice}")
 
 
 def _present(target: Path, description: Mapping[str, Any], sums: Mapping[str, str]) -> Dataset:
@@ -242,15 +236,13 @@ def _present(target: Path, description: Mapping[str, Any], sums: Mapping[str, st
     if is_other:
         raise BadInputError(f"{target} exists already and holds something else; delete it or choose another folder.")
     if changed:
-        raise CorruptDatasetError(
-            f"{target} was altered: it differs from what is shared in {', '.join(changed)}. "
-            "Delete it, or pull to another folder."
-        )
+        where = f"it differs from what is shared in {', '.join(changed)}"
+        raise CorruptDatasetError(f"{target} was altered: {where}. Delete it, or pull to another folder.")
     return dataset
 
 
 def _check(folder: Path, sums: Mapping[str, str], description: Mapping[str, Any], name: str) -> None:
-    """Check that the downloaded files are the complete dataset; they may have been written by anybody."""
+    """Check that the files, which anybody may have written, are the complete dataset."""
     if wrong := altered(folder, sums):
         for path in wrong:
             (folder / path).unlink(missing_ok=True)

@@ -180,9 +180,8 @@ class HubStore:
             api.create_repo(self.repo, repo_type=KIND, private=private or None, exist_ok=True)
             if private and not api.repo_info(self.repo, repo_type=KIND).private:
                 raise BadInputError(
-                    f"{self.repo} exists already and is public, expected a private repository. Nothing was "
-                    "uploaded: make it private in its settings on the Hub, choose another, or leave out "
-                    "--private."
+                    f"{self.repo} exists already and is public, expected a private repository. Nothing was uploaded: "
+                    "make it private in its settings on the Hub, choose another, or leave out --private."
                 )
 
     def versions(self) -> list[Version]:
@@ -216,9 +215,7 @@ class HubStore:
             head = api.repo_info(self.repo, repo_type=KIND).sha
             there = api.list_repo_files(self.repo, revision=head, repo_type=KIND)
             if layout.INFO_PATH in there and SUMS_PATH not in there:
-                raise BadInputError(
-                    f"{self.repo} holds a dataset that astra-data did not push; choose another repository."
-                )
+                raise BadInputError(f"{self.repo} holds a dataset that astra-data did not push; choose another one.")
             files = dataset_files(dataset.root)
             old = [path for path in there if path.startswith(("data/", "meta/")) and path not in files]
             commit = api.create_commit(

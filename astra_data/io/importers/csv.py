@@ -113,10 +113,7 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
 
 
 def _joined(source: Source, mapping: ImportMapping) -> Iterator[Block]:
-    """Yield the rows of the file that has the state, each with the last ones of the other files.
-
-    Rows without such ones, or with ones older than `split.gap_s`, are left out, and an episode ends there.
-    """
+    """Yield the rows of the file with the state, each with the last ones of the others, up to `split.gap_s` old."""
     time = mapping.time
     if time is None:
         raise BadInputError(f"{source}: files are joined by time: set `time` to the field with the times")

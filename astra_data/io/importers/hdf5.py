@@ -68,10 +68,8 @@ def _opened(source: Source) -> Iterator[tuple[Any, Any]]:
 def layout(source: Source) -> dict[str, Any]:
     """Return the keys of a mapping for a file in the layout of D4RL, d3rlpy or robomimic.
 
-    Of robomimic, the state is all of `obs` with one or two dimensions (images are left out) but actions, in
-    the order of their names; `dones` is taken as terminated, as robomimic's own learners do. It may stay set
-    while success lasts: rows after its first are episodes of one step, left out unless truncation is recorded
-    too. The demonstrations' attribute `success` is that of their last steps.
+    Of robomimic, the state is all of `obs` with one or two dimensions but actions, in the order of their names; `dones`
+    is taken as terminated, as its own learners do; the attribute `success` is that of a demonstration's last step.
     """
     with _opened(source) as (h5py, file):
         fields = stored_datasets(h5py, file)

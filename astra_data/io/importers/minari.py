@@ -69,12 +69,9 @@ def _fields(episode: Any) -> dict[str, Array]:
     infos = dict(_parts("infos", episode.infos or {}))  # None where none were recorded
     with_reset = {name: values for name, values in infos.items() if len(values) == len(episode.rewards) + 1}
     between = observations | with_reset
-    steps = {
-        **infos,
-        **{name: values[:-1] for name, values in between.items()},
-        **{f"next_{name}": values[1:] for name, values in between.items()},
-        **dict(_parts("actions", episode.actions)),
-    }
+    steps = infos | {name: values[:-1] for name, values in between.items()}
+    steps |= {f"next_{name}": values[1:] for name, values in between.items()}
+    steps |= dict(_parts("actions", episode.actions))
     for name in ("rewards", "terminations", "truncations"):
         steps[name] = np.asarray(getattr(episode, name))
     return steps
@@ -94,9 +91,7 @@ def _after_steps(fields: dict[str, Array], mapping: ImportMapping, origin: str) 
     after = [name for name in with_reset if name in others]
     for name in after:
         fields[name] = fields[f"next_{name}"]
-    if not after:
-        return ()
-    return (f"{', '.join(after)}: of one entry more than steps, each step has the one after it",)
+    return (f"{', '.join(after)}: of one entry more than steps, each step has the one after it",) if after else ()
 
 
 def _parts(name: str, value: Any) -> Iterator[tuple[str, Array]]:

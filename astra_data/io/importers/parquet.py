@@ -31,16 +31,10 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
 
 def _values_of(metadata: pq.FileMetaData, fields: set[str]) -> int:
     """Return how many values the columns hold; compressed zeros take hardly any bytes."""
-    chunks = (
-        metadata.row_group(group).column(column)
-        for group in range(metadata.num_row_groups)
-        for column in range(metadata.num_columns)
-    )
-    return sum(
-        chunk.num_values
-        for chunk in chunks
-        if any(chunk.path_in_schema == field or chunk.path_in_schema.startswith(f"{field}.") for field in fields)
-    )
+    groups = [metadata.row_group(number) for number in range(metadata.num_row_groups)]
+    chunks = [group.column(number) for group in groups for number in range(metadata.num_columns)]
+    paths = tuple(f"{field}." for field in fields)
+    return sum(chunk.num_values for chunk in chunks if f"{chunk.path_in_schema}.".startswith(paths))
 
 
 def _array(column: pa.Array, origin: str) -> Array:

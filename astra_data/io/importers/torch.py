@@ -37,9 +37,8 @@ def layout(source: Source) -> dict[str, Any]:
     tensors = _tensors(source)
     missing = [field for field in (TIME, *PACE.values()) if field not in tensors]
     if missing:
-        raise BadInputError(
-            f"{source}: not a joint log of PACE (time, dof_pos, des_dof_pos): no {', '.join(missing)}; pass --mapping"
-        )
+        named = f"a joint log of PACE (time, dof_pos, des_dof_pos): no {', '.join(missing)}"
+        raise BadInputError(f"{source}: not {named}; pass --mapping")
     times = tensors[TIME].double().numpy().ravel()
     if len(times) < 2 or not times[-1] > times[0]:
         raise BadInputError(f"{source}: expected times that rise; pass --mapping without `time`")
