@@ -51,10 +51,7 @@ DIRECT = "values that commands move"
 
 @dataclass(frozen=True)
 class StateEntry:
-    """A part of abstract states, a value, or an angle that is kept as cosine and sine.
-
-    `code` is one expression of the variables of its `fields`, or two for an angle.
-    """
+    """A part of abstract states: `code` of a value, or of cosine and sine of an angle, by names of its `fields`."""
 
     name: str
     unit: str
@@ -73,10 +70,7 @@ class StateEntry:
 
 @dataclass(frozen=True)
 class SimulatorKind:
-    """An abstract simulator of X values and A commands, as code: what was fitted, and what to check.
-
-    `driven` are the variables of the commands that it uses, by a command's name.
-    """
+    """An abstract simulator of X values and A commands, as code; `driven` are variables of commands by their names."""
 
     logs: Logs
     called: str
@@ -149,10 +143,7 @@ class SimulatorKind:
         return np.abs(found - ends).mean(axis=0), np.abs(starts - ends).mean(axis=0)
 
     def slopes(self, moves: Callable[[Floats, Floats], Floats], steps: int) -> list[float]:
-        """Return how many times as far as it the robot goes, by `moves` (T, K) from states to states (T, X).
-
-        Sums of `steps` are compared: over one step, what lags behind looks slow. It is 0 where it stands.
-        """
+        """Return how many times as far the robot `moves` (T, K) in so many steps, as a lag is slow in one; or 0."""
         sums: list[list[Floats]] = []
         for states, commands in self.episodes():
             landed = self.after(states[:-1], [commands[:-1]])
@@ -178,14 +169,8 @@ def first_simulator(logs: Logs) -> SimulatorKind:
         if not rest.entries:
             raise BadInputError("found no state that a command could move: name it as its command, cmd_q1 and q1")
         return rest
-    return replace(
-        good,
-        entries=good.entries + rest.entries,
-        driven=good.driven | rest.driven,
-        lines=good.lines + rest.lines,
-        constants=good.constants | rest.constants,
-        remarks=good.remarks + rest.remarks,
-    )
+    merged = {name: getattr(good, name) + getattr(rest, name) for name in ("entries", "lines", "remarks")}
+    return replace(good, driven=good.driven | rest.driven, constants=good.constants | rest.constants, **merged)
 
 
 def filled(name: str, values: Mapping[str, str]) -> str:
@@ -215,12 +200,22 @@ def unpacked(names: Sequence[str]) -> str:
 def _planar(logs: Logs) -> list[SimulatorKind]:
     """Return simulators of robots on a plane, if there are a position and a heading that commands move."""
     states, names = {one.plain: one for one in logs.of("state")}, identifiers(logs.of("state"))
-    position = _position(logs, states)
+    position = next(
+        (
+            (name, f"{name.removesuffix(one)}{other}")
+            for one, other in AXES
+            for name in sorted(states, key=len)
+            if name.endswith(one) and f"{name.removesuffix(one)}{other}" in states
+            if PLACE.fullmatch(name) or len(one) > 2
+        ),
+        None,
+    )
     if position is None:
         return []
-    place = [StateEntry(axis, "m", (one,), (names[one.name],)) for axis, one in zip("xy", position, strict=True)]
+    fields = [states[name] for name in position]
+    place = [StateEntry(axis, "m", (one,), (names[one.name],)) for axis, one in zip("xy", fields, strict=True)]
     found = []
-    for heading, remarks in _headings(states, names, position[0].plain):
+    for heading, remarks in _headings(states, names, position[0]):
         for called, driven, lines in _drives(logs.of("command")):
             step = ("heading = torch.atan2(heading_y, heading_x)", *lines)
             kind = SimulatorKind(logs, called, (*place, heading), driven, step, _sizes(lines, 1.0, 1.0), remarks)
@@ -237,17 +232,6 @@ def _sizes(lines: Sequence[str], speed: float, turn: float) -> dict[str, float]:
     """Return the constants of a drive's lines, by the slopes of its speed and turning where all are 1."""
     sizes = {"SPEED_PER_COMMAND": speed, "TURN_PER_COMMAND": turn, "TRACK_M": speed / turn, "WHEELBASE_M": 1 / turn}
     return {name: float(f"{size:.3g}") for name, size in sizes.items() if any(name in line for line in lines)}
-
-
-def _position(logs: Logs, states: dict[str, Field]) -> tuple[Field, Field] | None:
-    """Return the fields of a position that moves, that of the shortest name."""
-    for one, other in AXES:
-        for name in (name for name in sorted(states, key=len) if name.endswith(one)):
-            partner = states.get(name.removesuffix(one) + other)
-            is_place = partner and (PLACE.fullmatch(name) or len(one) > 2)
-            if partner and is_place and any(np.ptp(v, axis=0).any() for v in logs.values((states[name], partner))):
-                return states[name], partner
-    return None
 
 
 def _headings(states: dict[str, Field], names: dict[str, str], beside: str) -> list[tuple[StateEntry, tuple[str, ...]]]:
@@ -294,7 +278,11 @@ def _drives(commands: Sequence[Field]) -> list[tuple[str, dict[str, str], tuple[
     turns = turns or [command for command in commands if command.unit == "rad/s"]
     straight = [command for command in commands if command not in turns]
     axes = {"x": "forward", "surge": "forward", "y": "left", "sway": "left"}
-    ways = {axes.get(m["axis"]): c for c in straight if (m := _along(c)) and c.unit in ("1", "m/s")}
+    ways = {
+        axes.get(m["axis"]): c
+        for c in straight
+        if (m := BODY.fullmatch(c.plain) or AXIS_SPEED.fullmatch(c.plain)) and c.unit in ("1", "m/s")
+    }
     found: list[tuple[str, dict[str, str], tuple[str, ...]]] = []
     if {"forward", "left"} <= ways.keys():
         turned, end = {turn.name: "turn" for turn in turns[:1]}, (turning,) * bool(turns)
@@ -324,15 +312,10 @@ def _drives(commands: Sequence[Field]) -> list[tuple[str, dict[str, str], tuple[
     return found + scaled if factors else found
 
 
-def _along(command: Field) -> re.Match[str] | None:
-    return BODY.fullmatch(command.plain) or AXIS_SPEED.fullmatch(command.plain)
-
-
 def _is_turn_rate(command: Field) -> bool:
     """Return whether a heading changes by it."""
-    if command.unit == "rad/s" and HEADING.fullmatch(command.plain):
-        return True
-    return command.unit in ("1", "rad/s") and TURN_RATE.fullmatch(command.plain) is not None
+    is_turned = command.unit == "rad/s" and HEADING.fullmatch(command.plain)
+    return bool(is_turned or (command.unit in ("1", "rad/s") and TURN_RATE.fullmatch(command.plain)))
 
 
 def _forward_and_turn(before: Floats, after: Floats) -> Floats:
@@ -345,9 +328,7 @@ def _forward_and_turn(before: Floats, after: Floats) -> Floats:
 def _direct(logs: Logs, planar: SimulatorKind | None) -> SimulatorKind:
     """Return the simulator of the other commands: each moves the state of the same name."""
     taken = [one for entry in planar.entries for one in entry.fields] if planar else []
-    parts = {one.plain for one in logs.of("state") if QUATERNION.fullmatch(one.plain)}
-    whole = {name for name in parts if {f"{name[:-1]}{axis}" for axis in "wxyz"} <= parts}
-    left = [one for one in logs.of("state") if one not in taken and one.plain not in whole]
+    left = [one for one in logs.of("state") if one not in taken]
     moves: list[tuple[Field, list[Field]]] = []
     for command in (one for one in logs.of("command") if not planar or one.name not in planar.driven):
         moves.append((command, _moved(command, left, is_alone=len(logs.of("command")) == 1)))
@@ -355,48 +336,50 @@ def _direct(logs: Logs, planar: SimulatorKind | None) -> SimulatorKind:
     idle = [command.short for command, found in moves if not found]
     remarks = [f"{' and '.join(idle)} {'has' if len(idle) == 1 else 'have'} no effect"] if idle else []
     if turned := [one.short for one in left if HEADING.fullmatch(one.plain) or "angle" in one.plain]:
-        is_alone = len(turned) == 1
-        remarks.append(
-            f"{' and '.join(turned)} {'is' if is_alone else 'are'} not in φ, though failures may come of "
-            f"{'it' if is_alone else 'them'}"
-        )
-    if whole and not planar:
-        remarks.append(f"{', '.join(sorted(whole))} are a quaternion: make yaw of it in φ")
+        are, them = ("is", "it") if len(turned) == 1 else ("are", "them")
+        remarks.append(f"{' and '.join(turned)} {are} not in φ, though failures may come of {them}")
     moves = [(command, found) for command, found in moves if found]
     inputs, variables = identifiers(logs.of("state")), identifiers(logs.of("command"), "cmd_")
-    words = {"x", "y", "heading", *(planar.driven.values() if planar else ())}
-    names = {key: f"s_{name}" if planar and name in words else name for key, name in inputs.items()}
+    words = {"x", "y", "heading", *planar.driven.values()} if planar else set()
+    names = {key: f"s_{name}" if name in words else name for key, name in inputs.items()}
     driven = {command.name: variables[command.name] for command, _ in moves}
 
     def simulator(rates: Sequence[bool], constants: dict[str, float]) -> SimulatorKind:
-        entries: list[StateEntry] = []
-        lines: list[str] = []
+        entries, lines = [], []
         for (command, found), is_rate in zip(moves, rates, strict=True):
-            given, at = variables[command.name], [names[one.name] for one in found]
+            given, at, now = variables[command.name], [names[one.name] for one in found], names[found[0].name]
             for one in found:
-                angle = f"of.cos({inputs[one.name]})", f"of.sin({inputs[one.name]})"
-                code = angle if _goes_around(logs, one) else (inputs[one.name],)
+                code: tuple[str, ...] = (inputs[one.name],)
+                if (
+                    one.unit == "rad"
+                    and HEADING.fullmatch(one.plain)
+                    and np.ptp(np.concatenate(logs.values([one]))) > np.pi
+                ):
+                    code = (f"of.cos({code[0]})", f"of.sin({code[0]})")
+                    now = f"torch.atan2({now}_y, {now}_x)"
                 entries.append(StateEntry(names[one.name], one.unit, (one,), code))
             if command.unit in FORCES:
                 lines.append(f"{at[-1]} = {at[-1]} + {at[-1].upper()}_PER_FORCE * {given} * TIMESTEP_S")
                 lines += [f"{at[0]} = {at[0]} + {at[1]} * TIMESTEP_S"] if len(at) > 1 else []
             else:
-                now = f"torch.atan2({at[0]}_y, {at[0]}_x)" if len(entries[-1].code) > 1 else at[0]
                 lines.append(f"{at[0]} = {now} + {given} * TIMESTEP_S" if is_rate else f"{at[0]} = {given}")
         return SimulatorKind(logs, DIRECT, tuple(entries), driven, tuple(lines), constants, tuple(remarks))
 
-    if not moves:
-        return simulator([], {})
     pushed = [names[found[-1].name] for command, found in moves if command.unit in FORCES]
     plain = simulator([True] * len(moves), {f"{name.upper()}_PER_FORCE": 1.0 for name in pushed})
+    if not moves:
+        return plain
+    places = {entry.fields[0]: [plain.names.index(name) for name in entry.names] for entry in plain.entries}
     at = [plain.names.index(name) for name in pushed]
     slopes = plain.slopes(lambda before, after: (after - before)[:, at], 1) if at else []
     gains = dict(zip(plain.constants, slopes, strict=True))
     one, other = (simulator([is_rate] * len(moves), gains).errors()[0] for is_rate in (True, False))
     rates = []
-    for command, found in moves:
-        at = [plain.names.index(name) for e in plain.entries if e.fields[0] is found[0] for name in e.names]
-        rates.append(not _is_same(command, found[0]) and bool(one[at].sum() <= other[at].sum()))
+    for command, (state, *_) in moves:  # whether it is what is commanded, or what the command is a rate of
+        is_same = command.unit == state.unit
+        if "1" in (command.unit, state.unit):
+            is_same = _is_speed(state) and command.plain == state.plain
+        rates.append(not is_same and bool(one[places[state]].sum() <= other[places[state]].sum()))
     return simulator(rates, gains)
 
 
@@ -424,16 +407,3 @@ def _key(one: Field) -> str:
 
 def _is_speed(one: Field) -> bool:
     return one.unit.endswith("/s") or SPEED.search(one.plain) is not None or _is_turn_rate(one)
-
-
-def _is_same(command: Field, state: Field) -> bool:
-    """Return whether a state is what is commanded, and not what the command is a rate of."""
-    if "1" not in (command.unit, state.unit):
-        return command.unit == state.unit
-    return _is_speed(state) and command.plain == state.plain
-
-
-def _goes_around(logs: Logs, one: Field) -> bool:
-    """Return whether it is a heading that turns by more than half a turn in the logs."""
-    span = np.ptp(np.concatenate(logs.values([one])))
-    return one.unit == "rad" and HEADING.fullmatch(one.plain) is not None and bool(span > np.pi)

@@ -7,12 +7,9 @@ import math
 import re
 import shlex
 import sys
-import sysconfig
-from collections.abc import Iterable, Mapping, Sequence
-from importlib.resources import files
+from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from pathlib import Path
-from string import Template
 
 import numpy as np
 
@@ -25,49 +22,36 @@ from astra_data.dataset.format import INFO_PATH
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import locate, names_at_home
 from astra_data.io.guessing import HEADING, Field, Logs, Role, csv_files, guess, logs_of
-from astra_data.pipeline.first_simulator import DIRECT, SimulatorKind, first_simulator, unpacked
+from astra_data.pipeline.first_simulator import DIRECT, SimulatorKind, filled, first_simulator, unpacked
 
-_COLUMNS: dict[Role, str] = {
-    "state": STATE,
-    "command": ACTION,
-    "goal": GOAL,
-    "failure": TERMINATED,
-    "success": SUCCESS,
-    "reward": REWARD,
-}
+_COLUMNS: dict[Role, str] = {"state": STATE, "command": ACTION, "goal": GOAL}
+_COLUMNS |= {"failure": TERMINATED, "success": SUCCESS, "reward": REWARD}
 _TAKEN = sys.stdlib_module_names | {"astra_data", "conftest", "logs", "numpy", "pytest", "torch"}
 """Names whose file would be found in place of a module, or is that of the mapping."""
 _FILES = {"task.py": "{}.py", "recipe.toml": "{}.toml", "test.py": "test_{}.py", "README.md": "README.md"}
 
 
 def write_robot(name: str, out: Path, logs: Sequence[Path]) -> SimulatorKind:
-    """Write the new folder `out` of the robot `name`, of CSV files or folders of them, or of one dataset.
-
-    Return the simulator that it begins with.
-    """
+    """Write the new folder `out` of a robot, of CSV files, folders of them, or a dataset; return its simulator."""
     if not re.fullmatch("[a-z][a-z0-9_]*", name):
         raise BadInputError(f"'{name}': expected a name of a-z, 0-9 and _, such as my_cart, that begins with a letter")
-    if name in _TAKEN or keyword.iskeyword(name) or _is_installed(name):
+    spec = importlib.util.find_spec(name)
+    is_installed = spec and {"site-packages", "dist-packages"} & {*Path(spec.origin or "").parts}
+    if name in _TAKEN or keyword.iskeyword(name) or is_installed:
         raise BadInputError(f"'{name}': expected a name that Python does not use, such as my_{name}")
     with atomic_folder(out) as folder:
         data = _dataset(logs)
         found = logs_of(data) if data else guess(logs)
         simulator = first_simulator(found)
         values = _values(name, simulator)
+        values |= dict.fromkeys(("and_mapping", "versions", "import_line", "mapping_row"), "")
         if data:
-            values |= dict.fromkeys(("and_mapping", "versions", "import_line", "mapping_row"), "")
             values |= {"data": _code(str(data.root.resolve())), "dataset": shlex.quote(str(data.root.resolve()))}
         else:
             values |= _of_mapping(name, [path.resolve() for path in logs])
         for template, written in (_FILES if data else _FILES | {"logs.toml": "logs.toml"}).items():
-            (folder / written.format(name)).write_text(_template(template, values), encoding="utf-8")
+            (folder / written.format(name)).write_text(filled(template, values), encoding="utf-8")
     return simulator
-
-
-def _is_installed(name: str) -> bool:
-    spec = importlib.util.find_spec(name)
-    places = [Path(sysconfig.get_path(kind)) for kind in ("purelib", "platlib")]
-    return bool(spec and spec.origin and any(Path(spec.origin).is_relative_to(place) for place in places))
 
 
 def _dataset(logs: Sequence[Path]) -> Dataset | None:
@@ -180,10 +164,8 @@ def _objective(simulator: SimulatorKind) -> dict[str, str]:
         every = np.concatenate(logs.values(goals))
         use = "" if taken else "; nothing below uses them"
         bounds = f"{_code(every.min(axis=0))}, {_code(every.max(axis=0))}, (count, {len(goals)})"
-        text = (
-            f"\n    goal_size = {len(goals)}\n\n    def draw_goals(self, rng, count):  # CHECK: where goals are{use}\n "
-            f"       return rng.uniform({bounds})"
-        )
+        text = f"\n    goal_size = {len(goals)}\n\n    def draw_goals(self, rng, count):  # CHECK: where goals are{use}"
+        text += f"\n        return rng.uniform({bounds})"
     values = {
         "command_size": str(len(logs.of("command"))),
         "goals": text,
@@ -204,13 +186,8 @@ def _objective(simulator: SimulatorKind) -> dict[str, str]:
         "goal_line": "" if taken else f"GOAL = {_code(tuple(goal * shares))}  # CHECK: where to go\n",
         "close": f"{way / 10:.2g}",
         "range": f"{way:.3g}" if is_planar else _code(tuple(spans)),
-        "objective": _template("planar.py" if is_planar else "direct.py", values),
+        "objective": filled("planar.py" if is_planar else "direct.py", values),
     }
-
-
-def _template(name: str, values: Mapping[str, str]) -> str:
-    text = (files("astra_data.pipeline") / f"robot_files/{name}.template").read_text(encoding="utf-8")
-    return Template(text).substitute(values)
 
 
 def _goals_of(simulator: SimulatorKind, *, is_planar: bool) -> list[int]:
@@ -224,12 +201,8 @@ def _goals_of(simulator: SimulatorKind, *, is_planar: bool) -> list[int]:
 
 
 def _typical(episodes: Sequence[Floats], logs: Logs) -> tuple[Floats, float]:
-    """Return the end (D,) of the episode whose distance from its start is the median, and this distance.
-
-    Failed episodes do not count, unless all are. If it ends where it began, it is the farthest of all.
-    """
-    fields = logs.of("failure")
-    failed = [any(bool(one[field.name].any()) for field in fields) for one in logs.episodes]
+    """Return the end (D,) of the episode of median length, failed ones apart, and its distance or the farthest."""
+    failed = [any(bool(one[field.name].any()) for field in logs.of("failure")) for one in logs.episodes]
     kept = [values for values, fails in zip(episodes, failed, strict=True) if not fails] or episodes
     ways = [float(np.linalg.norm(values[-1] - values[0])) for values in kept]
     typical = int(np.argsort(ways)[len(ways) // 2])
