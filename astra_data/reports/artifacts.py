@@ -2,11 +2,11 @@
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Literal, Self
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, JsonValue, model_validator
+from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
 from astra_data.core.artifact import check_intact
 from astra_data.core.config import read_written
@@ -92,21 +92,6 @@ class Evaluation(Artifact):
     encoders: dict[str, dict[str, float]] = Field(default_factory=dict)
     """Mean of each measure by encoder, if there is more than one."""
 
-    @model_validator(mode="after")
-    def _one_number_per_episode(self) -> Self:
-        wrong = [
-            f"{world}.{name} has {len(values)}"
-            for world in ("target", "simulated", "raw", "grounded")
-            if (outcomes := getattr(self, world)) is not None
-            for name, values in outcomes.model_dump(by_alias=True).items()
-            if len(values) != self.episodes
-        ]
-        if wrong:
-            raise ValueError(f"expected {self.episodes} episodes, but {', '.join(wrong)}")
-        if getattr(self, self.tested_in) is None:
-            raise ValueError(f"expected outcomes in {self.tested_in}, got none")
-        return self
-
     @property
     def outcomes(self) -> Outcomes:
         """The outcomes where the row was tested."""
@@ -189,16 +174,6 @@ class Gap(Artifact):
     grounded: dict[str, Band]
     raw: dict[str, Band]
     still: dict[str, Band] | None = None
-
-    @model_validator(mode="after")
-    def _one_number_per_horizon(self) -> Self:
-        if set(self.grounded) != set(self.raw):
-            raise ValueError(f"grounded has {sorted(self.grounded)}, but raw has {sorted(self.raw)}")
-        for name, band in [*self.grounded.items(), *self.raw.items(), *(self.still or {}).items()]:
-            lengths = {len(band.mean), len(band.low), len(band.high)}
-            if lengths != {len(self.horizons)}:
-                raise ValueError(f"expected {len(self.horizons)} numbers for {name}, got {sorted(lengths)}")
-        return self
 
 
 class DatasetFile(Artifact):

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -40,16 +40,8 @@ def write_held_out(
                 run.grounding(Owner(row, seed, percent))
     if not run.errors:
         return None
-    results = Results(
-        recipe=recipe,
-        task="",
-        command="",
-        rows=tuple(groundings),
-        episodes=0,
-        timestep_s=timestep_s,
-        lines=run.lines,
-        errors=run.errors,
-    )
+    parts: dict[str, Any] = {"timestep_s": timestep_s, "lines": run.lines, "errors": run.errors}
+    results = Results(recipe=recipe, task="", command="", rows=tuple(groundings), episodes=0, **parts)
     seeds_text = ", ".join(map(str, sorted({one.seed for one in results.errors})))
     blocks: list[Block] = [
         Text(
@@ -84,11 +76,8 @@ def gap_blocks(results: Results) -> Iterator[Block]:
         f"{steps} step{'s' if steps > 1 else ''}{f' ({steps * step_s:.3g} s)' if step_s else ''}" for steps in horizons
     ]
     for quantity in quantities:
-        lines = [
-            [*_size(results, percent), *line]
-            for percent, of in means.items()
-            for line in _error_lines(results, of, quantity, horizons)
-        ]
+        of_sizes = {percent: _error_lines(results, of, quantity, horizons) for percent, of in means.items()}
+        lines = [[*_size(results, percent), *line] for percent, of in of_sizes.items() for line in of]
         head = [*_size(results), "simulator", *titles]
         yield TableBlock(f"Error of `{quantity}`", head, lines, words=len(head) - len(horizons))
     last = means[results.largest]

@@ -280,11 +280,8 @@ def _costs(results: Results) -> Iterator[Block]:
     wall, cpu = (stage_seconds(results, clock) for clock in ("wall_seconds", "cpu_seconds"))
     speeds = _speeds(results)
     stages = (*DATASET_STAGES, "ground", "train", "align", "select", "evaluate")
-    lines = [
-        [stage, duration(wall.get(stage)), duration(cpu.get(stage)), speeds.get(stage, "")]
-        for stage in stages
-        if stage in wall or stage in speeds
-    ]
+    shown = [stage for stage in stages if stage in wall or stage in speeds]
+    lines = [[of, duration(wall.get(of)), duration(cpu.get(of)), speeds.get(of, "")] for of in shown]
     elapsed = elapsed_seconds(results)
     total = ["whole recipe", duration(sum(wall.values())), duration(sum(cpu.values()) or None), ""]
     yield Text(f"Wall time of the whole recipe: {duration(elapsed)}, in which several stages may run at once.")
@@ -332,18 +329,15 @@ def _speeds(results: Results) -> dict[str, str]:
 
 def _every_seed(results: Results) -> Iterator[Block]:
     table, left_out = results.table, [one.measure for one in COLUMNS if not _is_shown(results, one)]
-    found = table[(table["where"] == TESTED) & table["row"].isin(results.tested())]
-    found = found[~found["measure"].isin(left_out)]
+    is_shown = ~table["measure"].isin(left_out)
+    found = table[(table["where"] == TESTED) & table["row"].isin(results.tested()) & is_shown]
     wide = found.pivot_table(index=["row", "percent", "seed"], columns="measure", values="value", sort=False)
     swept = results.is_swept
     order = [key for row in results.tested() for key in wide.index if key[0] == row]
-    lines = [
-        [
-            *(method_title(row), *([f"{percent} %"] if swept else []), f"{seed}"),
-            *("-" if np.isnan(value) else f"{value:.4g}" for value in wide.loc[(row, percent, seed)]),
-        ]
-        for row, percent, seed in order
-    ]
+    lines = []
+    for row, percent, seed in order:
+        cells = ["-" if np.isnan(value) else f"{value:.4g}" for value in wide.loc[(row, percent, seed)]]
+        lines.append([method_title(row), *([f"{percent} %"] if swept else []), f"{seed}", *cells])
     names = [str(name).replace("_", " ") for name in wide.columns]
     yield TableBlock("", ["method", *(["size"] if swept else []), "seed", *names], lines, words=1 + swept)
 
@@ -352,10 +346,10 @@ def _provenance(results: Results) -> Iterator[Block]:
     yield Text("Produced by")
     yield Code(results.command)
     items = []
-    for what in ("Code", "Machine", "Versions"):
+    for number, what in enumerate(("Code", "Machine", "Versions")):
         stages: dict[str, list[str]] = {}
         for origin in results.origins:
-            stages.setdefault(_described(origin)[what], []).extend(origin.stages)
+            stages.setdefault(_described(origin)[number], []).extend(origin.stages)
         # What all stages share stands alone.
         texts = [f"{text} ({', '.join(dict.fromkeys(of))})" for text, of in stages.items()]
         items.append(f"{what}: {'; '.join(texts if len(stages) > 1 else stages)}.")
@@ -371,21 +365,16 @@ def _provenance(results: Results) -> Iterator[Block]:
         what = "Dataset named by evaluations" if stage == "evaluate" else f"Dataset of `{stage}`"
         items.append(f"{what}: {named}, content {', '.join(contents)}.")
     yield Text("", items)
-    yield Text(
-        "With this machine and these versions, the same seeds give the same numbers. All numbers and "
-        "settings are in `results.json`."
-    )
+    text = "With this machine and these versions, the same seeds give the same numbers."
+    yield Text(f"{text} All numbers and settings are in `results.json`.")
 
 
-def _described(origin: Origin) -> dict[str, str]:
+def _described(origin: Origin) -> tuple[str, str, str]:
     """Return code, machine and versions in words."""
     commit, on = (origin.commit or "").removesuffix("-dirty"), origin.machine
     changed = " with uncommitted changes" if commit != origin.commit else ""
+    code = f"commit `{commit}`{changed}" if commit else "not recorded"
     gpu = f", {on.gpu}" if on and on.gpu else ""
-    machine = on and f"{on.cpu}, {on.cores} cores, {on.memory_gib:g} GiB of memory{gpu}"
+    machine = f"{on.cpu}, {on.cores} cores, {on.memory_gib:g} GiB of memory{gpu}" if on else "not recorded"
     versions = [f"{name} {version}" for name, version in origin.packages.items() if version is not None]
-    return {
-        "Code": f"commit `{commit}`{changed}" if commit else "not recorded",
-        "Machine": machine or "not recorded",
-        "Versions": ", ".join(versions) or "not recorded",
-    }
+    return code, machine, ", ".join(versions) or "not recorded"

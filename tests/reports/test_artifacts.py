@@ -3,18 +3,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fake_runs import band, edit_json, outcomes, write_evaluation, write_json
+from fake_runs import edit_json, outcomes, write_evaluation
 from safetensors.numpy import save_file
 
 from astra_data.core.artifact import write_manifest
 from astra_data.core.errors import BadInputError
-from astra_data.reports.artifacts import (
-    Evaluation,
-    Gap,
-    read_json,
-    read_tensors,
-    way_to_success,
-)
+from astra_data.reports.artifacts import Evaluation, read_json, read_tensors, way_to_success
 
 
 @pytest.fixture
@@ -45,36 +39,12 @@ def test_a_file_that_was_altered_is_not_read(name: str, path: Path) -> None:
 
 
 def test_a_malformed_artifact_is_named_with_every_fault(path: Path) -> None:
-    edit_json(path, episodes=5, wall_seconds="long", seed=None)
+    edit_json(path, wall_seconds="long", seed=None)
     with pytest.raises(BadInputError, match=r"evaluation.json is not .*wall_seconds: .*seed: "):
-        read_json(Evaluation, path)
-    edit_json(path, wall_seconds=1.0, seed=1)
-    with pytest.raises(BadInputError, match=r"expected 5 episodes, but target.success has 4"):
-        read_json(Evaluation, path)
-    edit_json(path, episodes=4, raw=outcomes([1, 0], 1))
-    with pytest.raises(BadInputError, match=r"raw.success has 2.*raw.return has 2"):
         read_json(Evaluation, path)
     path.write_text("{")
     with pytest.raises(BadInputError, match=r"file: .*; run that stage again"):
         read_json(Evaluation, path)
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"raw": {"turn_rad": band(1.0)}}, "grounded has .*position_m.*, but raw has .*turn_rad"),
-        ({"horizons": [1, 10, 100]}, r"expected 3 numbers for position_m, got \[2\]"),
-        ({"grounded": {"position_m": band(1.0) | {"low": [0.5]}}}, r"for position_m, got \[1, 2\]"),
-    ],
-)
-def test_a_gap_has_one_error_per_horizon_and_quantity(tmp_path: Path, changes: dict[str, object], message: str) -> None:
-    path = tmp_path / "gap.json"
-    good = {"horizons": [1, 10], "grounded": {"position_m": band(0.1)}, "raw": {"position_m": band(1.0)}}
-    write_json(path, good)
-    assert read_json(Gap, path).grounded["position_m"].mean == [0.1, 0.2]
-    write_json(path, good | changes)
-    with pytest.raises(BadInputError, match=message):
-        read_json(Gap, path)
 
 
 def test_tensors_are_checked_and_become_float64(tmp_path: Path) -> None:

@@ -104,15 +104,7 @@ def test_rates_have_three_digits(rate: float, text: str) -> None:
 
 @pytest.mark.parametrize(
     ("seconds", "text"),
-    [
-        (None, "-"),
-        (0, "0 s"),
-        (99, "99 s"),
-        (100, "2 min"),
-        (5399, "90 min"),
-        (5400, "1.5 h"),
-        (36000, "10.0 h"),
-    ],
+    [(None, "-"), (0, "0 s"), (99, "99 s"), (100, "2 min"), (5399, "90 min"), (5400, "1.5 h"), (36000, "10.0 h")],
 )
 def test_times_are_in_a_unit_that_suits_them(seconds: float | None, text: str) -> None:
     assert blocks.duration(seconds) == text

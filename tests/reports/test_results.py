@@ -35,14 +35,7 @@ def results(*lines: Line, **changes: object) -> Results:
 def error(row: str, seed: int, simulator: str, *mean: float, horizons: tuple[int, ...] = (1, 10)) -> Errors:
     low, high = [0.5 * one for one in mean], [2 * one for one in mean]
     return Errors(
-        row=row,
-        seed=seed,
-        simulator=simulator,
-        quantity="x_m",
-        horizons=[*horizons],
-        mean=[*mean],
-        low=low,
-        high=high,
+        row=row, seed=seed, simulator=simulator, quantity="x_m", horizons=[*horizons], mean=[*mean], low=low, high=high
     )
 
 

@@ -26,10 +26,7 @@ def results(
     """Of episodes without success, the share `failing` are failures."""
     lines = [
         Line(
-            row=row,
-            seed=seed,
-            where=where,
-            values={"success": one, "steps": 100 * one, "failed": failing * (1 - one)},
+            row=row, seed=seed, where=where, values={"success": one, "steps": 100 * one, "failed": failing * (1 - one)}
         )
         for where, of in ((TESTED, target), (SIMULATED, simulated or {}))
         for row, scores in of.items()

@@ -10,7 +10,8 @@ from matplotlib.ticker import LogLocator, NullLocator
 
 from astra_data.core.arrays import Floats
 from astra_data.core.naming import is_plus
-from astra_data.reports.figures.style import FAINT, INK, Scene, draw_band, look, method_color, method_title, style
+from astra_data.methods import method_title
+from astra_data.reports.figures.style import FAINT, INK, Scene, draw_band, look, method_color, style
 from astra_data.reports.results import Results
 from astra_data.reports.runs import SHARED_WORLDS
 

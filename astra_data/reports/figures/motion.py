@@ -13,18 +13,9 @@ from matplotlib.patches import Patch, Rectangle
 
 from astra_data.core.arrays import Bools, Floats
 from astra_data.core.errors import BadInputError
+from astra_data.methods import method_title
 from astra_data.reports.artifacts import EVALUATION, TRAJECTORIES, Evaluation, read_json, read_tensors
-from astra_data.reports.figures.style import (
-    DEPLOYED,
-    FAINT,
-    INK,
-    SIMULATED,
-    WALL,
-    Scene,
-    method_color,
-    method_title,
-    style,
-)
+from astra_data.reports.figures.style import DEPLOYED, FAINT, INK, SIMULATED, WALL, Scene, method_color, style
 from astra_data.reports.results import Results
 from astra_data.worlds.plane.mazes import Maze
 from astra_data.worlds.task import Task

@@ -15,6 +15,7 @@ from astra_data.core.arrays import Floats
 from astra_data.core.naming import artifact_key, base_method, is_plus
 from astra_data.dataset.inspection import Map, visited
 from astra_data.dataset.reader import Dataset
+from astra_data.methods import method_title
 from astra_data.reports.figures.style import (
     FAINT,
     INK,
@@ -23,7 +24,6 @@ from astra_data.reports.figures.style import (
     draw_visits,
     look,
     method_color,
-    method_title,
     score_axis,
     style,
 )

@@ -103,15 +103,10 @@ def method_color(method: str) -> str:
     return color.lower()
 
 
-def method_title(method: str) -> str:
-    """Return what a row is called."""
-    from astra_data import methods
-
-    return methods.method_title(method)
-
-
 def look(row: str) -> dict[str, Any]:
     """Return color, dashes and label of a method's lines."""
+    from astra_data.methods import method_title
+
     return {"color": method_color(row), "ls": "--" if is_plus(row) else "-", "label": method_title(row)}
 
 

@@ -67,10 +67,7 @@ def test_observed_rates_stand_over_predicted_ones_above_their_numbers_of_steps()
     assert equal.get_linestyle() == "--"
     assert [np.asarray(axis).tolist() for axis in equal.get_data()] == [[0, 1], [0, 1]]
     assert [np.asarray(axis).tolist() for axis in first.get_data()] == nas[:2].tolist()
-    assert [line.get_color() for line in (first, second)] == [
-        method_color("nas"),
-        method_color("astra_plus"),
-    ]
+    assert [line.get_color() for line in (first, second)] == [method_color("nas"), method_color("astra_plus")]
     assert (first.get_linestyle(), second.get_linestyle()) == ("-", "--")
     counts, _ = model_steps.lines
     assert [np.asarray(axis).tolist() for axis in counts.get_data()] == nas[[0, 2]].tolist()

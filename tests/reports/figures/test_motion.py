@@ -207,15 +207,10 @@ def test_each_axis_of_a_mismatch_has_its_own_values_and_bands() -> None:
             heights = np.asarray(band.get_paths()[0].vertices)[:, 1]
             assert band.get_alpha() == alpha
             assert [heights.min(), heights.max()] == pytest.approx([at + apart * end for end in ends])
-    assert {line.get_linestyle(): np.asarray(line.get_ydata())[0] for line in sent.lines} == {
-        "-": 0.8,
-        ":": -0.5,
-    }
+    assert {line.get_linestyle(): np.asarray(line.get_ydata())[0] for line in sent.lines} == {"-": 0.8, ":": -0.5}
 
 
-def test_simulator_and_target_are_sent_the_same_commands_from_the_same_place(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_simulator_and_target_are_sent_the_same_commands_from_the_same_place(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("astra_data.reports.figures.motion._ROBOTS", 8)
     task = TASKS["nao-navigation"]
     replay = replay_commands(task)

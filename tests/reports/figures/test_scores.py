@@ -92,10 +92,7 @@ def test_curves_have_a_panel_per_method_and_a_band_from_worst_to_best(scene: Sce
 def test_curves_are_compared_where_all_seeds_have_scores() -> None:
     nan = float("nan")
     steps, scores = on_one_grid(
-        [
-            (np.array([0.0, 10.0, 20.0]), np.array([nan, 1.0, 2.0])),
-            (np.array([5.0, 15.0]), np.array([0.0, 1.0])),
-        ]
+        [(np.array([0.0, 10.0, 20.0]), np.array([nan, 1.0, 2.0])), (np.array([5.0, 15.0]), np.array([0.0, 1.0]))]
     )
     assert (steps[0], steps[-1]) == (10.0, 15.0)
     np.testing.assert_allclose(scores[:, [0, -1]], [[1.0, 1.5], [0.5, 1.0]])

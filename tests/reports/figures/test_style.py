@@ -33,9 +33,7 @@ def test_every_row_has_its_own_color_and_a_plus_row_its_base_rows_darker() -> No
     assert method_color("my_own") == method_color("my_own")
 
 
-def test_drawing_leaves_the_callers_settings_alone_and_needs_no_display(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_drawing_leaves_the_callers_settings_alone_and_needs_no_display(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
     before = dict(matplotlib.rcParams)
     image = png(bars("nas"))
