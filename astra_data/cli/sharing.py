@@ -48,8 +48,8 @@ def import_(
     from astra_data.core.naming import printable
     from astra_data.io.importing import import_dataset
 
-    told: dict[str, Any] = {"name": name, "fps": fps, "task": task, "file_format": file_format}
-    report = import_dataset(recordings, mapping, out=out, max_bytes=max_bytes, skip_bad=skip_bad, **told)
+    given: dict[str, Any] = {"name": name, "fps": fps, "task": task, "file_format": file_format}
+    report = import_dataset(recordings, mapping, out=out, max_bytes=max_bytes, skip_bad=skip_bad, **given)
     typer.echo("\n".join(map(printable, f"finished: {report}".split("\n"))))
 
 

@@ -21,10 +21,17 @@ from astra_data.core.durable import alone_in, clean, folder_for, make_folder, mo
 from astra_data.core.errors import BadInputError, MissingStageError, optional
 from astra_data.core.naming import RECORD, RUNS, reference_of, row_of_key, stage_of_key
 from astra_data.methods import grounded_as, method_named
-from astra_data.pipeline.condition import Condition, condition, data_condition, to_make_again
 from astra_data.pipeline.display import display
 from astra_data.pipeline.executors import EXECUTORS, Item
-from astra_data.pipeline.experiment import ALWAYS_NEW, Experiment, load_experiment
+from astra_data.pipeline.experiment import (
+    ALWAYS_NEW,
+    Condition,
+    Experiment,
+    condition,
+    data_condition,
+    load_experiment,
+    to_make_again,
+)
 from astra_data.pipeline.plan import RunPoint, Selection, check_stage, plan, stages_until
 from astra_data.pipeline.recipe import WHOLE
 from astra_data.pipeline.stages.registry import STAGES

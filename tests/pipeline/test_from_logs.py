@@ -16,8 +16,7 @@ from astra_data.dataset.columns import GOAL, REWARD
 from astra_data.dataset.edit import delete, subset
 from astra_data.dataset.reader import Dataset
 from astra_data.io.importing import import_dataset
-from astra_data.pipeline.condition import condition
-from astra_data.pipeline.experiment import load_experiment
+from astra_data.pipeline.experiment import condition, load_experiment
 from astra_data.pipeline.plan import Selection, plan
 from astra_data.pipeline.run import check, set_aside, write_errors
 from astra_data.pipeline.stages.label import label

@@ -121,8 +121,8 @@ def augment(
     ) as writer:
         for index, episode in enumerate(source.episodes()):
             if held_out[index] or config.keep_originals:
-                told = {**episode.metadata, "held_out": bool(held_out[index])}
-                writer.add(Episode(episode.uid, episode.columns, told))
+                original = {**episode.metadata, "held_out": bool(held_out[index])}
+                writer.add(Episode(episode.uid, episode.columns, original))
             for copy in range(copies[index]):
                 copied = relocation.copied(episode, moving, generator(seed, f"augment {episode.uid} {copy}"))
                 if copied is None:
