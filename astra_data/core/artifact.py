@@ -111,10 +111,8 @@ def check_intact(path: Path) -> None:
     """Refuse a file whose bytes are not those in the manifest beside it, if there is one."""
     manifest = _manifest_beside(path)
     if manifest and path.name in manifest.files and manifest.files[path.name][1] != durable.file_digest(path):
-        raise BadInputError(
-            f"{path} was altered since it was made: restore it from a copy, or remove {path.parent} and run "
-            "the recipe again"
-        )
+        advice = f"restore it from a copy, or remove {path.parent} and run the recipe again"
+        raise BadInputError(f"{path} was altered since it was made: {advice}")
 
 
 def check_made_from(made: Path, read: Mapping[str, str | None]) -> None:

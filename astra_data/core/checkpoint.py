@@ -73,10 +73,8 @@ def resumed(checkpoint: Path) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]
     try:
         yield _from_json(metadata["state"], tensors), metadata
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise BadInputError(
-            f"{checkpoint}: expected a checkpoint of this version, found something else ({error}): "
-            f"remove {checkpoint.parent}"
-        ) from error
+        expected = f"expected a checkpoint of this version, found something else ({error})"
+        raise BadInputError(f"{checkpoint}: {expected}: remove {checkpoint.parent}") from error
 
 
 @contextmanager
@@ -99,9 +97,8 @@ def understood(
         yield moved, metadata
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         found = f"no {error}" if isinstance(error, KeyError) else " ".join(str(error).split())
-        raise BadInputError(
-            f"{path}: expected {what} as this version writes it, found {found}: run that stage again"
-        ) from error
+        wanted = f"expected {what} as this version writes it"
+        raise BadInputError(f"{path}: {wanted}, found {found}: run that stage again") from error
 
 
 def as_part(tensors: Mapping[str, Tensor], part: str) -> dict[str, Tensor]:

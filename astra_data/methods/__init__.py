@@ -85,10 +85,8 @@ def add_method(name: str, place: str) -> None:
     if kind := method.grounding:
         owner = KINDS.setdefault(kind.kind, kind)
         if owner is not kind:
-            raise BadInputError(
-                f"{place}: groundings of kind '{kind.kind}' are those of {owner.__name__} in "
-                f"{owner.__module__}: rename its kind"
-            )
+            whose = f"{owner.__name__} in {owner.__module__}"
+            raise BadInputError(f"{place}: groundings of kind '{kind.kind}' are those of {whose}: rename its kind")
     if isinstance(method.fit, HistoryFit):
         encoder = method.fit.encoder
         if ENCODERS.setdefault(encoder.kind, encoder) is not encoder:

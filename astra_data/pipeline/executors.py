@@ -189,9 +189,7 @@ def execute(
 ) -> None:
     """Run `items` in spawned processes, each as soon as its inputs are finished.
 
-    Those that step the target's physics share the cores. When an item fails, at Ctrl-C or SIGTERM, or when
-    this process is killed, the others are stopped; their last checkpoints stay.
-
+    When an item fails, at Ctrl-C or SIGTERM, or when this process is killed, the others are stopped.
     What an item prints goes to `<key>.txt` in `logs`. `prepare` is called in the process of an item before it.
 
     Raises:
@@ -324,10 +322,8 @@ def execute_on_cluster(
     try:
         ray.init(address, log_to_driver=False, logging_level="ERROR", **local)
     except (ConnectionError, RuntimeError, ValueError) as error:
-        raise BadInputError(
-            f"found no usable Ray cluster at {address}: {_first_line(error)}; `ray status` lists clusters, "
-            "`ray start --head` starts one"
-        ) from None
+        advice = "`ray status` lists clusters, `ray start --head` starts one"
+        raise BadInputError(f"found no usable Ray cluster at {address}: {_first_line(error)}; {advice}") from None
     running: dict[Any, str] = {}
     here = Path.cwd(), sys.path
 

@@ -1,13 +1,8 @@
-"""Experiments: a recipe, the folder of its artifacts, and the recipe that it is based on, if any.
+"""Experiments: a recipe, the folder of its artifacts and their condition, and the recipe that it is based on, if any.
 
-    based_on = "antmaze_umaze"
-
-A recipe with this line lists only the differences from the recipe of that name beside it. A stage whose
-artifacts would be the base's is not run again: a link in the recipe's folder leads to them. It may have
-another task with the same target; then it shares the collected episodes.
-
-What an artifact is made with is written down before it is begun, in `made_with/<key>.json`: its settings and
-the digests of the user's code. While they are others, what was made or begun with them is refused.
+A stage whose artifacts would be the base's is not run again: a link in the recipe's folder leads to them. What an
+artifact is made with, its settings and the digests of the user's code, is written to `made_with/<key>.json` before it
+is begun. While they are others, what was made or begun with them is refused.
 """
 
 import json
@@ -103,10 +98,8 @@ class Experiment:
             if self._is_link(stage):
                 link.unlink()
             if stage in self.borrowed and (link.exists() or link.is_symlink()):
-                raise RecipeError(
-                    f"{link} is in the way: {self.path} is based on {source}, whose {stage} it uses; "
-                    f"give the recipe another name, or remove {link}"
-                )
+                uses = f"{self.path} is based on {source}, whose {stage} it uses"
+                raise RecipeError(f"{link} is in the way: {uses}; give the recipe another name, or remove {link}")
             if stage in self.borrowed:
                 link.symlink_to(Path("..") / source / stage)
 
@@ -167,10 +160,8 @@ class Experiment:
         files = [file for name in names if (file := self.results / f"{name}.json").exists()]
         for file in files:
             if changed := self._changed_since(read_results(file)):
-                raise RecipeError(
-                    f"{changed} in {self.path} since the results in {file} were made: move them away to "
-                    "publish the new ones without them"
-                )
+                since = f"{changed} in {self.path} since the results in {file} were made"
+                raise RecipeError(f"{since}: move them away to publish the new ones without them")
         return files
 
     def _changed_since(self, found: Results) -> str:
@@ -378,10 +369,8 @@ def data_condition(recipe: Recipe) -> Condition | None:
     except BadInputError as error:
         raise BadInputError(f"data: {str(error).rstrip('.')}: import or pull it first") from None
     if ABSTRACT_STATE in source.features:
-        raise BadInputError(
-            f"data: {source.reference} is paired already, but a recipe pairs its data itself: name the "
-            "dataset that this one was made from (see `astra-data log`)"
-        )
+        advice = "name the dataset that this one was made from (see `astra-data log`)"
+        raise BadInputError(f"data: {source.reference} is paired already, but a recipe pairs its data itself: {advice}")
     task = task_named(recipe.task)
     check_fits(source, task)
     grounds = any(method_named(row).grounds for row in recipe.methods)

@@ -67,10 +67,8 @@ def evaluate_policy(
     rows = list(dict.fromkeys([*settings.get("methods", []), row]))
     tested = {"seeds": [seed]} | settings | {"methods": rows}
     evaluate = _planned(run, tested, "evaluate", row, seed, percent, ("target_encoder", "reference"))
-    episodes = training.episodes
-    evaluate(
-        policy=PolicyFile(own, simulation, episodes.reference, episodes.content_hash), out=Path(out), progress=progress
-    )
+    file = PolicyFile(own, simulation, training.episodes.reference, training.episodes.content_hash)
+    evaluate(policy=file, out=Path(out), progress=progress)
 
 
 def _world(
@@ -80,10 +78,8 @@ def _world(
     add_all(settings.get("own_methods", {}))
     learn = method_named(row).learn
     if not isinstance(learn, InSimulator):
-        raise BadInputError(
-            f"{row} is not trained in a simulator: expected a row that is, such as nas, or "
-            "direct_transfer for the raw simulator"
-        )
+        expected = "expected a row that is, such as nas, or direct_transfer for the raw simulator"
+        raise BadInputError(f"{row} is not trained in a simulator: {expected}")
     if unknown := sorted(options.keys() - {*OPTIONS, "num_envs"}):
         raise BadInputError(f"Grounded-v0: unknown option '{unknown[0]}'{did_you_mean(unknown[0], OPTIONS)}")
     changed = {"methods": [row], "seeds": [seed], "train": settings.get("train", {}) | options}

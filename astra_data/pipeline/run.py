@@ -1,8 +1,4 @@
-"""Run recipes: make every artifact that is not finished yet, for every row, seed and size.
-
-A point, a row on a seed and a size, is finished when its evaluation is; `sweep.csv` in the recipe's folder
-has one line per finished point.
-"""
+"""Run recipes: make every artifact that is not finished yet; `sweep.csv` has a line per finished evaluation."""
 
 import csv
 import re
@@ -135,21 +131,14 @@ def run_stage(
     experiment = load_experiment(recipe_path, root)
     maker = experiment.maker(stage)
     if maker is not experiment:
-        raise BadInputError(
-            f"{recipe_path} uses the {stage} of {maker.path}: run `astra-data {stage} {maker.path}` instead"
-        )
+        uses = f"{recipe_path} uses the {stage} of {maker.path}"
+        raise BadInputError(f"{uses}: run `astra-data {stage} {maker.path}` instead")
     recipe, folder = experiment.recipe, experiment.folder
     if stage == "collect" and recipe.data is not None:
         raise BadInputError(f"{recipe_path} uses the data {recipe.data}: there is nothing to collect")
-    planned = plan(
-        recipe,
-        recipe_path,
-        folder,
-        Selection.of(recipe, methods, seeds),
-        device=device,
-        publish=experiment.results if publish else None,
-        published=experiment.published() if publish else (),
-    )
+    selection, results = Selection.of(recipe, methods, seeds), experiment.results if publish else None
+    published = experiment.published() if publish else ()
+    planned = plan(recipe, recipe_path, folder, selection, device=device, publish=results, published=published)
     make(experiment, _selected(planned, stage, methods), planned, jobs=jobs, device=device)
     return folder / stage
 
@@ -338,10 +327,7 @@ def _line(experiment: Experiment, point: RunPoint) -> dict[str, Any]:
 
 
 def _needed(key: str, items: Mapping[str, Item]) -> Iterator[str]:
-    """Yield `key` and the keys of all artifacts that it is made of.
-
-    An evaluation is made of the policy and its encoder, not of the simulators in which it tests them.
-    """
+    """Yield `key` and the keys of all artifacts that it is made of; simulators that only test it are not."""
     yield key
     for read in items[key].inputs:
         if not (key.startswith("evaluate/") and read.startswith("ground/")):
@@ -354,9 +340,8 @@ def _tracked(project: str, recipe: str) -> Callable[[dict[str, Any]], None]:
 
     def log(line: dict[str, Any]) -> None:
         named = {key: line[key] for key in ("method", "percent", "seed")}
-        name = f"{recipe} {' '.join(map(str, named.values()))}"
-        settings = {key: value for key, value in line.items() if isinstance(value, str)}
-        trackio.init(project=project, name=name, config=named | settings)
+        settings = named | {key: value for key, value in line.items() if isinstance(value, str)}
+        trackio.init(project=project, name=" ".join(map(str, (recipe, *named.values()))), config=settings)
         trackio.log({key: value for key, value in line.items() if isinstance(value, float)})
         trackio.finish()
 

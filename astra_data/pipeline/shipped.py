@@ -53,9 +53,7 @@ class ShippedRecipe:
         """The title under which it is listed."""
         if self.is_mapping:
             return "Mappings, for astra-data import LOGS --mapping"
-        if self.name in START_HERE:
-            return "Start here"
-        return _ROBOTS.get(self.task.partition("-")[0], _EXAMPLES)
+        return "Start here" if self.name in START_HERE else _ROBOTS.get(self.task.partition("-")[0], _EXAMPLES)
 
     @property
     def duration(self) -> str:
@@ -112,11 +110,10 @@ def shipped(name: str) -> ShippedRecipe:
 def whereabouts(name: str) -> str:
     """Return where the recipe of a name, or of one like it, is, or how to get it; "" if none is alike."""
     recipes = {recipe.name: recipe for recipe in shipped_recipes() if not recipe.is_mapping}
-    for found in get_close_matches(name, recipes, n=1):
-        place = Path(RECIPES.name) / recipes[found].path
-        how = f"`astra-data recipes copy {found}` writes {place}"
-        return f"did you mean {place}?" if place.is_file() else how
-    return ""
+    if not (alike := get_close_matches(name, recipes, n=1)):
+        return ""
+    place = Path(RECIPES.name) / recipes[alike[0]].path
+    return f"did you mean {place}?" if place.is_file() else f"`astra-data recipes copy {alike[0]}` writes {place}"
 
 
 def copy_recipe(name: str, folder: Path) -> list[Path]:

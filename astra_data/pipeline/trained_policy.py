@@ -58,12 +58,10 @@ def trained_policy(run: str | Path, row: str, *, seed: int = 0, percent: int | N
     files = _files(settings, Path(run), row, seed, percent)
     data = Path(run) / artifact_key("pair" if percent is None else "subset", "", seed, percent)
     dataset = Dataset.open(data) if data.is_dir() else None
-    read = {
-        "grounding": file_digest(files["ground"]) if "ground" in files else None,
-        "dataset": dataset.content_hash if dataset else None,
-    }
+    grounding = file_digest(files["ground"]) if "ground" in files else None
+    data_hash = dataset.content_hash if dataset else None
     for made, file in files.items():
-        check_made_from(file, read if made != "ground" else read | {"grounding": None})
+        check_made_from(file, {"grounding": None if made == "ground" else grounding, "dataset": data_hash})
     return TrainedPolicy(settings, files, PolicyFile.load(files["train"]), dataset)
 
 

@@ -37,12 +37,11 @@ class UserMethod(Config):
 
     def settings(self, name: str) -> Config | None:
         """Return the settings of the method, which was added by `name`; None if it has none."""
-        given = self.model_extra or {}
-        table = METHODS[name].table
+        given, table = self.model_extra or {}, METHODS[name].table
         if table is None and given:
             raise BadInputError(f"{name}: {self.method} has no settings, got {', '.join(given)}")
         if table is None or not given:
-            return None if table is None else table.usual
+            return table.usual if table else None
         try:
             return validated(table.over_usual(given), table.model, name)
         except RecipeError as error:

@@ -142,10 +142,8 @@ def augment(
                 placed += 1
             progress((index + 1) / len(source), f"{placed} copies, no place for {lost}")
         if copies.any() and not placed:
-            raise BadInputError(
-                f"{source.reference}: found no place for any of {lost} copies: lower --margin-m "
-                f"({relocation.margin_m:g} m) or --min-steps, or raise --tries"
-            )
+            advice = f"lower --margin-m ({relocation.margin_m:g} m) or --min-steps, or raise --tries"
+            raise BadInputError(f"{source.reference}: found no place for any of {lost} copies: {advice}")
         skipped = int((~held_out & (copies == 0)).sum())
         writer.made = {"copies": placed, "copies_without_place": lost, "episodes_not_copied": skipped}
     return writer.root
@@ -156,10 +154,8 @@ def _task_of(source: Dataset, task: str | None) -> Task:
     if task is None and collected_for is None:
         raise BadInputError(f"{called} does not name its task: give --task")
     if task is None and is_user_code(str(collected_for)):
-        raise BadInputError(
-            f"{called} was collected for {collected_for}, whose code would be run: read it, then give "
-            f"--task {collected_for}"
-        )
+        advice = f"whose code would be run: read it, then give --task {collected_for}"
+        raise BadInputError(f"{called} was collected for {collected_for}, {advice}")
     if task is not None and collected_for in TASKS and task != collected_for:
         raise BadInputError(f"{called} was collected for {collected_for}, not for {task}")
     return task_named(task or str(collected_for))

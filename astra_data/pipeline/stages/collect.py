@@ -196,10 +196,8 @@ def _keep(least_steps: int, writer: StagedWriter) -> None:
     """Keep the first episodes that have `least_steps` together."""
     kept = sum(writer.lengths.values())
     if kept < least_steps:
-        raise BadInputError(
-            f"least_steps: expected {least_steps}, got {kept} in {len(writer.staged)} episodes: "
-            f"raise episodes, and delete {writer.folder}"
-        )
+        got, advice = f"got {kept} in {len(writer.staged)} episodes", f"raise episodes, and delete {writer.folder}"
+        raise BadInputError(f"least_steps: expected {least_steps}, {got}: {advice}")
     for position, steps in sorted(writer.lengths.items(), reverse=True):
         kept -= steps
         if kept < least_steps:

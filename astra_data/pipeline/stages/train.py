@@ -70,21 +70,13 @@ def train(
     correction = grounding_at(grounding_file, device)
     beginning = PolicyFile.load(initial_file, device) if initial_file else None
     if beginning and beginning.simulation and beginning.simulation.world.limits_commands:
-        raise BadInputError(
-            f"{initial} was trained with command_limit, which has no effect on '{method}': train it without"
-        )
+        fault = "was trained with command_limit, which has no effect on"
+        raise BadInputError(f"{initial} {fault} '{method}': train it without")
     grounding_digest = file_digest(grounding_file) if grounding_file else None
     initial_digest = file_digest(initial_file) if initial_file else None
-    settings_text = as_json(
-        task=world.name,
-        method=method,
-        **episodes.named,
-        grounding_sha256=grounding_digest,
-        initial_sha256=initial_digest,
-        seed=seed,
-        train=config,
-        settings=settings,
-    )
+    named = {"task": world.name, "method": method, **episodes.named}
+    sums = {"grounding_sha256": grounding_digest, "initial_sha256": initial_digest}
+    settings_text = as_json(**named, **sums, seed=seed, train=config, settings=settings)
     read = {"dataset": episodes.content_hash, "grounding": grounding_digest, "initial": initial_digest}
     with finished_folder(out, config=settings_text, made_from=read) as folder:
         training = Training(
