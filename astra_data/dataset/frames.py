@@ -16,7 +16,7 @@ from astra_data.core.durable import atomic_folder, held
 from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.core.provenance import memory_bytes
 from astra_data.core.seeding import generator
-from astra_data.dataset.columns import Array, Column
+from astra_data.dataset.columns import Array
 from astra_data.dataset.reader import Dataset
 
 Padding = Literal["valid", "edge"]
@@ -262,8 +262,15 @@ def mapped_columns(dataset: Dataset, names: Sequence[str], cache: Path) -> dict[
     parent.mkdir(parents=True, exist_ok=True)
     with held(parent, wait=True):
         for column in dataset.specs(names):
-            if not (parent / column.name).exists():
-                _write_raw(dataset, column, parent / column.name)
+            if (parent / column.name).exists():
+                continue
+            shape = (int(dataset.lengths.sum()), column.size)[: 1 + (column.size > 1)]
+            header = {"descr": np.dtype(column.dtype).str, "fortran_order": False, "shape": shape}
+            # Not as a memory map: where the disk is full, that would end the process with a bus error.
+            with atomic_folder(parent / column.name) as unfinished, (unfinished / "values.npy").open("wb") as file:
+                np.lib.format.write_array_header_1_0(file, header)  # type: ignore[no-untyped-call]
+                for block in dataset.blocks([column.name]):
+                    file.write(block[column.name].data)
     try:
         columns = {name: np.load(parent / name / "values.npy", mmap_mode="c") for name in names}
         faults = list(dataset.alterations(columns, dataset.selected(None)))
@@ -272,13 +279,3 @@ def mapped_columns(dataset: Dataset, names: Sequence[str], cache: Path) -> dict[
     if faults:
         raise CorruptDatasetError(f"{parent} was altered ({faults[0]}); delete it and try again.")
     return columns
-
-
-def _write_raw(dataset: Dataset, column: Column, folder: Path) -> None:
-    shape = (int(dataset.lengths.sum()), column.size)[: 1 + (column.size > 1)]
-    header = {"descr": np.dtype(column.dtype).str, "fortran_order": False, "shape": shape}
-    # Not as a memory map: where the disk is full, that would end the process with a bus error.
-    with atomic_folder(folder) as unfinished, (unfinished / "values.npy").open("wb") as file:
-        np.lib.format.write_array_header_1_0(file, header)  # type: ignore[no-untyped-call]
-        for block in dataset.blocks([column.name]):
-            file.write(block[column.name].data)

@@ -258,7 +258,12 @@ def remains_of(folder: Path, sources: Sequence[Dataset], notes: list[str]) -> Re
     if layout.METADATA_PATH not in altered:
         remains.metadata = _metadata(folder, notes)
     if layout.SUBSETS_PATH not in altered:
-        remains.subset_seed = _subset_seed(folder, notes)
+        subsets = read_object(folder / layout.SUBSETS_PATH)
+        seed = subsets.get("seed") if isinstance(subsets, dict) else None
+        remains.subset_seed = seed if isinstance(seed, int) else 0
+        if not isinstance(seed, int):
+            fault = subsets if isinstance(subsets, str) else "has no whole number as its seed"
+            notes.append(f"{layout.SUBSETS_PATH} {fault}: {_IF_ALTERED[layout.SUBSETS_PATH]}")
     return remains
 
 
@@ -284,13 +289,3 @@ def _description(folder: Path, remains: Remains, sources: Sequence[Dataset]) -> 
         return {"name": name_of(folder), "stage": "repair", "config": config, "environment": robot_of(remains.info)}
     parents = [other.identity for other in sources[1:]]
     return successor(old, "episodes", stage="repair", config=config, out=folder, parents=parents)[0]
-
-
-def _subset_seed(folder: Path, notes: list[str]) -> int:
-    """Return the seed of the subsets' order, 0 where it cannot be read."""
-    subsets = read_object(folder / layout.SUBSETS_PATH)
-    if isinstance(subsets, dict) and isinstance(seed := subsets.get("seed"), int):
-        return seed
-    fault = subsets if isinstance(subsets, str) else "has no whole number as its seed"
-    notes.append(f"{layout.SUBSETS_PATH} {fault}: {_IF_ALTERED[layout.SUBSETS_PATH]}")
-    return 0
