@@ -136,17 +136,6 @@ def test_a_star_stands_at_the_mean_goal_of_each_cell_and_a_ball_has_a_path_of_it
     np.testing.assert_allclose(np.asarray(dotted[0].get_xydata()), paths()[0] + 0.5)
 
 
-def test_mazes_are_four_wide_and_long_titles_small(scene: Scene) -> None:
-    rows = ["direct_transfer_iql_plus", *("nas", "astra", "iql", "rma")]
-    for row in rows:
-        write(scene.root, row, simulated=False)
-    figure = drawn(trajectories(results(*rows), scene))
-    grid = figure.axes[0].get_subplotspec()
-    assert grid is not None and grid.get_gridspec().get_geometry() == (2, 4)
-    sizes = [axes._left_title.get_fontsize() for axes in figure.axes[:2]]  # type: ignore[attr-defined]
-    assert sizes[0] < sizes[1] == 10.0
-
-
 @dataclass(frozen=True)
 class Filmed:
     """A task that is photographed."""
