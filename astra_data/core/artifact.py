@@ -120,10 +120,9 @@ def check_made_from(made: Path, read: Mapping[str, str | None]) -> None:
     manifest = _manifest_beside(made)
     made_from = manifest.made_from if manifest else {}
     if others := [name for name, digest in read.items() if digest and made_from.get(name, digest) != digest]:
-        raise BadInputError(
-            f"{made.parent} was made from another {' and another '.join(others)} than the one used with it: "
-            "restore the folders that belong together from a copy, or run the recipe again"
-        )
+        fault = f"was made from another {' and another '.join(others)} than the one used with it"
+        advice = "restore the folders that belong together from a copy, or run the recipe again"
+        raise BadInputError(f"{made.parent} {fault}: {advice}")
 
 
 def write_manifest(folder: Path, made_from: Mapping[str, str | None]) -> None:

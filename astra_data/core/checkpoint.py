@@ -1,6 +1,7 @@
 """Weights and training states on disk, as safetensors and JSON: written atomically, never pickled."""
 
 import json
+import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,7 +15,7 @@ from astra_data.core.artifact import check_intact
 from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import first_few
-from astra_data.core.progress import Alarm, Stopwatch
+from astra_data.core.progress import Stopwatch
 
 type Nested = Mapping[Any, "Nested"] | list["Nested"] | tuple["Nested", ...] | Tensor | bool | int | float | None
 """A training state, such as an optimizer's `state_dict()`."""
@@ -161,16 +162,16 @@ class Logbook:
             with resumed(checkpoint) as (state, metadata):
                 go_on(state)
                 self.points, spent = metadata["points"], metadata["spent"]
-        self.stopwatch, self._alarm = Stopwatch(spent), Alarm(CHECKPOINT_SECONDS)
+        self.stopwatch, self._kept = Stopwatch(spent), time.perf_counter()
 
     @property
     def is_due(self) -> bool:
         """Whether the next checkpoint is due."""
-        return self._alarm.rings
+        return time.perf_counter() - self._kept >= CHECKPOINT_SECONDS
 
     def keep(self, state: Mapping[str, Any]) -> None:
         """Write a checkpoint: `state` (see `save_state`), the points and the time spent."""
         if self._checkpoint is not None:
             metadata = {"points": self.points, "spent": self.stopwatch.spent()}
             save_state(self._checkpoint, state, metadata)
-        self._alarm.reset()
+        self._kept = time.perf_counter()

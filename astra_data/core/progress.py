@@ -34,20 +34,3 @@ class Stopwatch:
         """Return `wall_seconds`, `cpu_seconds` of all threads, and `finished_at`: now, in s since 1970."""
         cpu_seconds = time.process_time() - self._cpu_began
         return {"wall_seconds": self.seconds, "cpu_seconds": cpu_seconds, "finished_at": time.time()}
-
-
-class Alarm:
-    """A timer for work that is done every few `seconds`, such as writing a checkpoint."""
-
-    def __init__(self, seconds: float) -> None:
-        self._seconds = seconds
-        self.reset()
-
-    def reset(self) -> None:
-        """Restart the timer, once the work is done."""
-        self._began = time.perf_counter()
-
-    @property
-    def rings(self) -> bool:
-        """Whether the time has elapsed."""
-        return time.perf_counter() - self._began >= self._seconds
