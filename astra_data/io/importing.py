@@ -33,16 +33,8 @@ from astra_data.io.recording import VALUE_BYTES, Block, Source, find_sources, fo
 if TYPE_CHECKING:
     import datasets
 
-FORMATS: Mapping[str, ModuleType] = {
-    "csv": csv,
-    "hdf5": hdf5,
-    "json": json,
-    "mcap": mcap,
-    "minari": minari,
-    "npz": npz,
-    "parquet": parquet,
-    "torch": torch,
-}
+_MODULES = (csv, hdf5, json, mcap, minari, npz, parquet, torch)
+FORMATS: Mapping[str, ModuleType] = {module.__name__.rpartition(".")[2]: module for module in _MODULES}
 SUFFIXES = {name: getattr(module, "SUFFIXES", ()) for name, module in FORMATS.items()}
 """The endings of the names of each format's files; a Minari dataset is a folder."""
 _NAMED = 50  # files with one and the same fault that are named

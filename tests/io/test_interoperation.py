@@ -1,4 +1,4 @@
-"""The other side runs on our datasets: lerobot's command lines, its training, HF datasets.
+"""The other side runs on our datasets: lerobot's command lines and its training.
 
 lerobot takes seconds to load, so all its commands run once before the tests, in forks of one process.
 """
@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from fake_dataset import COLUMNS, fake_episodes, writer
 
-from astra_data.dataset.columns import GOAL, STATE, Column, Episode
+from astra_data.dataset.columns import GOAL, Column, Episode
 from astra_data.dataset.doctor.check import check
 from astra_data.dataset.doctor.repair import repair
 from astra_data.dataset.reader import Dataset
@@ -22,10 +22,6 @@ from astra_data.dataset.reader import Dataset
 WARM = Path(__file__).parents[1] / "warm_commands.py"
 LOADED = [f"lerobot.scripts.lerobot_{name}" for name in ("train", "edit_dataset")]
 TRAINING_STEPS = 2
-READING = """import sys, datasets
-rows = datasets.load_dataset("parquet", data_files=sys.argv[1])["train"]
-print(len(rows), rows[9]["observation.state"], rows[9]["episode_uid"])
-"""
 
 
 class Runs(NamedTuple):
@@ -51,8 +47,6 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Runs:
     folder = tmp_path_factory.mktemp("lerobot")
     dataset = write_with_goal(folder / "set")
     at = [f"--root={dataset.root}"]
-    reading = folder / "reading.py"
-    reading.write_text(READING)
     edit = ["lerobot-edit-dataset", "--repo_id=a/b", *at]
     commands = {
         "delete": [
@@ -70,7 +64,6 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Runs:
             *["--num_workers=0", "--batch_size=4", f"--steps={TRAINING_STEPS}", "--log_freq=1"],
             *["--save_checkpoint=false", f"--output_dir={folder / 'training'}"],
         ],
-        "datasets": [str(reading), str(dataset.root / "data/*/*.parquet")],
     }
     settings = {
         "HF_HUB_OFFLINE": "1",
@@ -116,9 +109,3 @@ def test_our_metadata_is_joined_again_after_lerobot_deleted_episodes(runs: Runs,
 def test_lerobot_trains_act_on_it(runs: Runs) -> None:
     output = assert_succeeded(runs, "train")
     assert f"step:{TRAINING_STEPS}" in output.replace(" ", "")
-
-
-def test_hf_datasets_reads_the_parquet_files(runs: Runs) -> None:
-    output = assert_succeeded(runs, "datasets").splitlines()
-    state = runs.dataset.columns([STATE])[STATE][9].tolist()
-    assert f"55 {state} {2**53 + 1}" in output

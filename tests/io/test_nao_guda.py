@@ -1,21 +1,18 @@
-"""The mapping of the NAO's logs, on the logs."""
+"""The mapping of the NAO's logs."""
 
 import io
 import json
-import os
 import tarfile
 from pathlib import Path
 
 import numpy as np
-import pytest
 
-from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE, Array
+from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE
 from astra_data.dataset.reader import Dataset
 from astra_data.io.importing import import_dataset
 
 ROOT = Path(__file__).parents[2]
 MAPPING = ROOT / "recipes/imports/nao_guda.toml"
-FOLDERS = [ROOT.parent / "shared/data", Path(os.environ.get("ASTRA_DATA_LOGS", ROOT.parent / "shared/data"))]
 
 
 def test_the_mapping_fits_logs_of_the_same_form(tmp_path: Path) -> None:
@@ -40,26 +37,3 @@ def test_the_mapping_fits_logs_of_the_same_form(tmp_path: Path) -> None:
     np.testing.assert_array_equal(got[NEXT_STATE], expected[kept + 1])
     np.testing.assert_array_equal(got[ACTION], actions[kept].clip(-1, 1).astype(np.float32))
     assert dataset.features[STATE]["astra"]["unit"] == ["m", "m", "rad", "m", "m"]
-
-
-def test_the_real_logs(tmp_path: Path) -> None:
-    recordings = [folder / "nao_guda/traj.tar.gz" for folder in FOLDERS]
-    present = [path for path in recordings if path.is_file()]
-    if not present:
-        pytest.skip(f"no logs of the NAO in {FOLDERS[0]}; $ASTRA_DATA_LOGS names another folder")
-    report = import_dataset(present[:1], MAPPING, out=tmp_path / "out")
-    dataset = Dataset.open(report.root)
-    rows: list[Array] = []
-    with tarfile.open(present[0]) as archive:
-        for number in range(1, 21):
-            file = archive.extractfile(f"guda/trajectories_5_{number}.log")
-            assert file is not None
-            rows.append(np.array(json.load(file)["observations"]))
-    position = np.concatenate(rows)
-    jumps = np.linalg.norm(np.diff(position[:, :2], axis=0), axis=1) > 500
-    assert report.tally.rows == len(position) == 20_000 and report.tally.split_points == {"jump": int(jumps.sum())}
-    lengths = np.diff([0, *np.flatnonzero(jumps) + 1, 20_000]) - 1
-    assert dataset.lengths.tolist() == [length for length in lengths if length >= 60]
-    first = (position[0] * [0.001, 0.001, 1, 0.001, 0.001]).astype(np.float32)
-    np.testing.assert_array_equal(dataset.columns([STATE])[STATE][0], first)
-    assert abs(dataset.columns([ACTION])[ACTION]).max() == 1
