@@ -259,9 +259,9 @@ def remains_of(folder: Path, sources: Sequence[Dataset], notes: list[str]) -> Re
         remains.metadata = _metadata(folder, notes)
     if layout.SUBSETS_PATH not in altered:
         subsets = read_object(folder / layout.SUBSETS_PATH)
-        seed = subsets.get("seed") if isinstance(subsets, dict) else None
-        remains.subset_seed = seed if isinstance(seed, int) else 0
-        if not isinstance(seed, int):
+        stored = subsets.get("seed") if isinstance(subsets, dict) else None
+        remains.subset_seed = stored if isinstance(stored, int) else 0
+        if not isinstance(stored, int):
             fault = subsets if isinstance(subsets, str) else "has no whole number as its seed"
             notes.append(f"{layout.SUBSETS_PATH} {fault}: {_IF_ALTERED[layout.SUBSETS_PATH]}")
     return remains
