@@ -68,7 +68,7 @@ def gap_blocks(results: Results) -> Iterator[Block]:
     """Yield errors by horizon, what they mean, and how well rewards and failures are predicted."""
     if not results.errors:
         return
-    means = {percent: results.mean_errors(percent) for percent in results.percents}
+    means = {size: of for size in results.percents if not (of := results.mean_errors(size)).empty}
     horizons = sorted(set.intersection(*(set(of.index.get_level_values("horizon")) for of in means.values())))
     quantities = list(dict.fromkeys(error.quantity for error in results.errors))
     step_s = results.timestep_s
@@ -80,7 +80,7 @@ def gap_blocks(results: Results) -> Iterator[Block]:
         lines = [[*_size(results, percent), *line] for percent, of in of_sizes.items() for line in of]
         head = [*_size(results), "simulator", *titles]
         yield TableBlock(f"Error of `{quantity}`", head, lines, words=len(head) - len(horizons))
-    last = means[results.largest]
+    last = means[max(means)]
     if still := _no_better_than_still(last):
         names = ", ".join(f"`{name}`" for name in still)
         yield Text(

@@ -231,6 +231,16 @@ def test_what_cuts_every_row_is_named(tmp_path: Path, split: str, log: str, why:
         import_dataset([tmp_path / "logs"], mapping, out=tmp_path / "out")
 
 
+def test_times_are_scaled_to_seconds(tmp_path: Path) -> None:
+    """A log in ms, with a silence of 0.7 s: gaps and rate count in seconds."""
+    lines = [*drive(9, 100).splitlines(), *(f"{1500 + 100 * row},{row},{row}" for row in range(9))]
+    mapping = csv_logs(tmp_path, "\n".join(lines) + "\n")
+    mapping.write_text(mapping.read_text().replace("[split]", "time_scale = 0.001\n[split]"))
+    report = import_dataset([tmp_path / "logs"], mapping, out=tmp_path / "out")
+    assert report.episodes == 2 and report.tally.split_points == {"gap": 1}
+    assert report.tally.clock.startswith("10 Hz declared, 10 Hz by t")
+
+
 @pytest.mark.parametrize(
     ("set_keys", "told"),
     [

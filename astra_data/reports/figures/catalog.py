@@ -39,7 +39,7 @@ FIGURES = {
         trajectories,
         "Trajectories",
         "Orange, dashed: the policy in the simulator of its training. Blue: the same policy {where}. A "
-        "failed episode ends with a cross, a successful one at its goal (in a maze, a star). Starts and goals are "
+        "failed episode ends with a cross, a successful one at its goal (a star if drawn). Starts and goals are "
         "drawn separately in the two worlds, so lines are not pairs: compare their routes and where they end. "
         "The number is the success rate {where} over all episodes and seeds.",
         "methods",
