@@ -81,13 +81,19 @@ def shortest(steps: Floats, turns: Floats) -> Floats:
 
 def continuity(episodes: Iterable[Episode]) -> list[Finding]:
     """Tell of how many steps the next state is not the state of the row after it, to the bit."""
-    steps, broken = 0, dict[int, int]()
-    for episode in episodes:
-        state, arrived = as_rows(episode.columns[STATE]), as_rows(episode.columns[NEXT_STATE])
-        steps += len(state) - 1
-        broken[episode.uid] = int((arrived[:-1] != state[1:]).any(axis=1).sum())
-    uids = tuple(uid for uid, count in broken.items() if count)
-    what = f"steps whose {NEXT_STATE} is not the state of the next row: {sum(broken.values())} of {steps}"
+    return _of_torn({episode.uid: _torn(episode) for episode in episodes})
+
+
+def _torn(episode: Episode) -> tuple[int, int]:
+    """Return of how many steps of an episode that is so, and of how many it could be."""
+    state, arrived = as_rows(episode.columns[STATE]), as_rows(episode.columns[NEXT_STATE])
+    return int((arrived[:-1] != state[1:]).any(axis=1).sum()), len(state) - 1
+
+
+def _of_torn(torn: Mapping[int, tuple[int, int]]) -> list[Finding]:
+    uids = tuple(uid for uid, (count, _) in torn.items() if count)
+    broken, steps = (sum(counts) for counts in zip(*torn.values(), strict=True))
+    what = f"steps whose {NEXT_STATE} is not the state of the next row: {broken} of {steps}"
     advice = (
         "rows are missing, or the columns come from different logs: import again, without "
         f"{NEXT_STATE} in the mapping if each row is the state after the one before"
@@ -257,16 +263,24 @@ def check_up(dataset: Dataset, called: str | None = None) -> Checkup:
     found = _of_import(dataset) + [finding for clock in clocks for finding in clock.findings(called)]
     statistics = dataset.statistics()
     ranges = {name: np.array([statistics[name][key] for key in ("min", "max")], np.float64) for name in columns}
+    repeated, torn, motions = list[tuple[int, int]](), dict[int, tuple[int, int]](), list[_Motion]()
+    states = [name for name in (STATE, NEXT_STATE) if name in columns]
+    for episode in dataset.episodes(states) if STATE in columns else ():
+        state = as_rows(episode.columns[STATE])
+        repeated.append(_repeated(state))
+        motions.append(_motion(episode.uid, state))
+        if NEXT_STATE in columns:
+            torn[episode.uid] = _torn(episode)
     if STATE in columns:
-        found += repeats(_rows(dataset, STATE))
+        found += _of_repeats(repeated)
         found += shift(zip(_rows(dataset, STATE), _rows(dataset, ACTION), strict=True)) if ACTION in columns else []
         found += large_angles(columns[STATE], np.abs(ranges[STATE]).max(axis=0))
-        found += continuity(dataset.episodes([STATE, NEXT_STATE])) if NEXT_STATE in columns else []
+        found += _of_torn(torn) if torn else []
     found += duplicates(dataset.digests, uids, called)
     # What is the same where episodes begin is not constant, where none goes on.
     if STATE in columns and dataset.lengths.max() > 1:
         found += constant(columns[STATE], ranges[STATE])
-        found += stuck(columns[STATE], zip(uids, _rows(dataset, STATE), strict=True), called)
+        found += stuck(columns[STATE], motions, called)
     summary = []
     if ACTION in columns:
         found += constant(columns[ACTION], ranges[ACTION])
@@ -346,13 +360,18 @@ def constant(column: Column, extremes: Floats) -> list[Finding]:
     return [Finding("note", what, f"{why}, or leave it out of the mapping")]
 
 
-def stuck(column: Column, episodes: Iterable[tuple[int, Array]], called: str) -> list[Finding]:
-    """Tell which values rest in some of the `episodes`, uid and states (T, S), and move in most."""
-    long = [(uid, values) for uid, values in map(_motion, episodes) if values]
+_Motion = tuple[int, tuple[Floats, Floats, Floats, bool] | None]
+"""Uid of an episode and, if it is long enough, its longest rests (S,) as a share of its steps, the extremes (S,) of its
+values, and whether most steps move."""
+
+
+def stuck(column: Column, motions: Iterable[_Motion], called: str) -> list[Finding]:
+    """Tell which values rest in some episodes and move in most."""
+    long = [(uid, values) for uid, values in motions if values]
     if not long:
         return []
-    uids, motions = zip(*long, strict=True)
-    rests, lows, highs, others_move = (np.array(part) for part in zip(*motions, strict=True))
+    uids, measured = zip(*long, strict=True)
+    rests, lows, highs, others_move = (np.array(part) for part in zip(*measured, strict=True))
     spans, whole = highs - lows, highs.max(axis=0) - lows.min(axis=0)
     moves = np.mean((rests < MOVING) & (spans > SMALLEST_SPAN * whole), axis=0) > MOST
     found = (rests > STUCK) & others_move[:, None] & moves
@@ -361,9 +380,7 @@ def stuck(column: Column, episodes: Iterable[tuple[int, Array]], called: str) ->
     return [Finding("warning", what, f"leave them out: {deletion(called, where)}", tuple(where))] if where else []
 
 
-def _motion(episode: tuple[int, Array]) -> tuple[int, tuple[Floats, Floats, Floats, bool] | None]:
-    """Return an episode's uid, longest rests (S,) as a share of its steps, extremes, and whether most steps move."""
-    uid, state = episode
+def _motion(uid: int, state: Array) -> _Motion:
     if len(state) < FEWEST_STEPS:
         return uid, None
     changes = state[1:] != state[:-1]
@@ -434,11 +451,17 @@ def endings(
 
 def repeats(states: Iterable[Array]) -> list[Finding]:
     """Tell where many rows repeat the one before to the bit while the robot moves; `states` are (T, S)."""
-    steps = repeated = 0
-    for state in states:
-        runs = np.diff(np.flatnonzero((state[1:] != state[:-1]).any(axis=1))) - 1
-        repeated += int(runs[runs <= MOST_ROWS].sum())
-        steps += len(state) - 1
+    return _of_repeats([*map(_repeated, states)])
+
+
+def _repeated(state: Array) -> tuple[int, int]:
+    """Return how many rows of an episode do, and how many could."""
+    runs = np.diff(np.flatnonzero((state[1:] != state[:-1]).any(axis=1))) - 1
+    return int(runs[runs <= MOST_ROWS].sum()), len(state) - 1
+
+
+def _of_repeats(counts: Sequence[tuple[int, int]]) -> list[Finding]:
+    repeated, steps = (sum(each) for each in zip(*counts, strict=True))
     what = (
         f"{repeated} of {steps} steps repeat the state of the row before to the bit, between "
         "steps that move: the log is faster than its sensor, or rows were written twice"

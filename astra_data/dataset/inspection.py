@@ -79,32 +79,53 @@ class Inspection:
 
 
 def inspect_dataset(dataset: Dataset) -> Inspection:
-    """Summarize `dataset`, reading one episode at a time."""
+    """Summarize `dataset`, reading it once, one episode at a time."""
     ranges, successes = dataset.statistics(), dataset.successes()
+    spreads = [_empty_spread(column, ranges[column.name]) for column in dataset.schema]
+    positions, velocities = (_empty_map(dataset, role) for role in ("position", "vector"))
+    endings = Endings() if TERMINATED in dataset.features else None
+    for episode in dataset.episodes():
+        if endings is not None:
+            endings.add(episode.columns)
+        for spread in spreads:
+            _count(spread, episode.columns[spread.column.name])
+        for planar, group in filter(None, (positions, velocities)):
+            _visit(planar, episode.columns[STATE][:, group])
     return Inspection(
         reference=dataset.reference,
         fps=int(dataset.info["fps"]),
         lengths=dataset.lengths,
         success=None if successes is None else sum(value is True for value in successes),
-        endings=endings_of(dataset) if TERMINATED in dataset.features else None,
-        spreads=tuple(_spread(dataset, column, ranges[column.name]) for column in dataset.schema),
-        positions=visited(dataset),
-        velocities=visited(dataset, "vector"),
+        endings=endings,
+        spreads=tuple(spreads),
+        positions=positions and positions[0],
+        velocities=velocities and velocities[0],
     )
-
-
-def _spread(dataset: Dataset, column: Column, ranges: Mapping[str, Any]) -> Spread:
-    low, high, mean = (np.array(ranges[key], np.float64) for key in ("min", "max", "mean"))
-    span, counts = np.where(high > low, high - low, 1.0), np.zeros((column.size, BINS), np.int64)
-    for block in dataset.blocks([column.name]):
-        bins = (as_rows(block[column.name]).astype(np.float64) - low) / span * BINS
-        flat = np.clip(bins, 0, BINS - 1).astype(np.int64) + BINS * np.arange(column.size)
-        counts += np.bincount(flat.ravel(), minlength=counts.size).reshape(counts.shape)
-    return Spread(column, low, high, mean, counts)
 
 
 def visited(dataset: Dataset, role: str = "position") -> Map | None:
     """Map the robot's positions, or another planar `role` of its state; None if the state has none."""
+    if found := _empty_map(dataset, role):
+        planar, group = found
+        for block in dataset.blocks([STATE]):
+            _visit(planar, block[STATE][:, group])
+    return found and found[0]
+
+
+def _empty_spread(column: Column, ranges: Mapping[str, Any]) -> Spread:
+    low, high, mean = (np.array(ranges[key], np.float64) for key in ("min", "max", "mean"))
+    return Spread(column, low, high, mean, np.zeros((column.size, BINS), np.int64))
+
+
+def _count(spread: Spread, values: Array) -> None:
+    span = np.where(spread.high > spread.low, spread.high - spread.low, 1.0)
+    bins = (as_rows(values).astype(np.float64) - spread.low) / span * BINS
+    flat = np.clip(bins, 0, BINS - 1).astype(np.int64) + BINS * np.arange(spread.column.size)
+    spread.counts[:] += np.bincount(flat.ravel(), minlength=spread.counts.size).reshape(spread.counts.shape)
+
+
+def _empty_map(dataset: Dataset, role: str) -> tuple[Map, slice] | None:
+    """Return an empty map for the first pair with `role` in the state, and the pair's indices."""
     roles = [pair for column in dataset.schema if column.name == STATE for pair in column.roles]
     group = next((group for found, group in roles if found == role), None)
     if group is None:
@@ -113,12 +134,14 @@ def visited(dataset: Dataset, role: str = "position") -> Map | None:
     low, high = (np.array(ranges[key], np.float64)[group] for key in ("min", "max"))
     cell = float((high - low).max()) / CELLS or 1.0
     width, height = (max(1, int(cells)) for cells in np.ceil((high - low) / cell - 1e-9))
-    counts = np.zeros((height, width), dtype=np.int64)
-    for block in dataset.blocks([STATE]):
-        cells = np.floor((block[STATE][:, group] - low) / cell + 1e-9)
-        x, y = cells.clip(0, [width - 1, height - 1]).astype(np.int64).T
-        np.add.at(counts, (y, x), 1)
-    return Map(counts, low, cell)
+    return Map(np.zeros((height, width), dtype=np.int64), low, cell), group
+
+
+def _visit(planar: Map, points: Array) -> None:
+    height, width = planar.counts.shape
+    cells = np.floor((points - planar.origin) / planar.cell + 1e-9)
+    x, y = cells.clip(0, [width - 1, height - 1]).astype(np.int64).T
+    np.add.at(planar.counts, (y, x), 1)
 
 
 def endings_of(dataset: Dataset) -> Endings:

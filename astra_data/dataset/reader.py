@@ -155,7 +155,11 @@ class Dataset(Contents):
 
     def statistics(self) -> dict[str, dict[str, Any]]:
         """Return meta/stats.json, column to statistic to values; of a recording, min, max and mean."""
-        if self.recorded is not None:
+        return self._statistics
+
+    @cached_property
+    def _statistics(self) -> dict[str, dict[str, Any]]:
+        if self.recorded is not None:  # for which all values are read
             return ranges(self.blocks([column.name for column in self.schema]))
         found = read_object(self.root / STATS_PATH)
         if isinstance(found, str):

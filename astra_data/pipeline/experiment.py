@@ -387,8 +387,6 @@ def data_condition(recipe: Recipe) -> Condition | None:
 def _differing_bounds(limits: Commands, source: Dataset) -> list[str]:
     """Return a line for each axis whose bounds go beyond the commands in `source`, or are in other units."""
     statistics, lines = source.statistics(), list[str]()
-    if isinstance(statistics, str):
-        return []
     least, largest = (np.asarray(statistics[ACTION][end], float) for end in ("min", "max"))
     for (name, (low, high)), lowest, highest in zip(limits.items(), least, largest, strict=True):
         known = f"{name} may be {low:.4g} to {high:.4g}, recorded is {lowest:.4g} to {highest:.4g}: "

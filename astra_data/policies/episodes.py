@@ -95,8 +95,6 @@ class RecordedRange:
             statistics = Dataset.open(dataset).statistics()
         except AstraDataError:
             return None
-        if isinstance(statistics, str):
-            return None
         least, largest = (torch.from_numpy(np.asarray(statistics[ACTION][end], np.float32)) for end in ("min", "max"))
         return cls(least, largest, limits)
 

@@ -46,8 +46,6 @@ class Commands(dict[str, tuple[float, float]]):
         """Return the range of the commands in a dataset, named as every command takes it, as the bounds."""
         source = open_dataset(dataset)
         statistics = source.statistics()
-        if isinstance(statistics, str):
-            raise BadInputError(f"commands: the range of {source.reference} is not known: {statistics}")
         if ACTION not in statistics:
             raise BadInputError(f"commands: {source.reference} has no column {ACTION}: give their bounds")
         ends = np.array([statistics[ACTION][end] for end in ("min", "max")], float).T.tolist()
