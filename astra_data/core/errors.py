@@ -1,6 +1,7 @@
 """The exceptions that the toolkit raises; all expected ones are AstraDataErrors."""
 
 import re
+from collections.abc import Mapping
 from importlib import import_module
 from importlib.metadata import requires
 from pathlib import Path
@@ -44,6 +45,11 @@ def in_short(error: Exception) -> str:
     """Return the first sentence of an error message, of bounded length and printable."""
     line = str(error).split("\n")[0].split(". ")[0].rstrip(".:")
     return shortened(printable(line), _LONGEST)
+
+
+def unmet(checks: Mapping[str, object]) -> list[str]:
+    """Return what is wrong: the keys of `checks` whose values do not hold."""
+    return [fault for fault, holds in checks.items() if not holds]
 
 
 EXTRAS = {

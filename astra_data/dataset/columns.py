@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from astra_data.core.arrays import as_column
-from astra_data.core.errors import BadInputError
+from astra_data.core.errors import BadInputError, unmet
 
 STATE = "observation.state"  # (T, S) float32: the full target state s_t
 GOAL = "observation.environment_state"
@@ -94,7 +94,7 @@ class Column:
             },
             f"unknown role {unknown}, expected {', '.join(ROLES)}": not unknown,
         }
-        faults = [fault for fault, holds in checks.items() if not holds] or [
+        faults = unmet(checks) or [
             f"role {role} at index {group.start}, expected {ROLES[role]} indices of it side by side"
             for role, group in self.roles
             if words[group] != [role] * ROLES[role]
@@ -153,7 +153,7 @@ class Column:
             f"{self.name}: shape {values.shape}, expected {expected}": values.shape[1:]
             == (self.size,)[self.size == 1 :],
         }
-        return [fault for fault, holds in checks.items() if not holds]
+        return unmet(checks)
 
 
 OUTCOME_COLUMNS = (

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from xxhash import xxh3_64_intdigest
 
 from astra_data.core.durable import file_digest
-from astra_data.core.errors import BadInputError, CorruptDatasetError
+from astra_data.core.errors import BadInputError, CorruptDatasetError, unmet
 from astra_data.core.provenance import origin
 from astra_data.dataset import format as layout
 from astra_data.dataset.columns import Array
@@ -72,7 +72,7 @@ def _faults(description: Mapping[str, Any]) -> list[str]:
         checks[f"parent {parent!r:.80}, expected name, version and hash"] = is_one
     for key in ("config", "seeds", "environment", "simulator"):
         checks[f"{key} {description[key]!r:.80}, expected an object"] = isinstance(description[key], Mapping)
-    return [fault for fault, holds in checks.items() if not holds]
+    return unmet(checks)
 
 
 class ContentHash:

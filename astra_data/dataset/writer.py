@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from astra_data.core.durable import atomic_folder
-from astra_data.core.errors import BadInputError, CorruptDatasetError
+from astra_data.core.errors import BadInputError, CorruptDatasetError, unmet
 from astra_data.dataset import columns as names
 from astra_data.dataset import format as layout
 from astra_data.dataset.columns import Column, Episode, Scalar
@@ -96,7 +96,7 @@ class DatasetWriter:
             ),
             f"task {task!r}, expected text of valid characters": isinstance(task, str) and is_text(task),
         }
-        if faults := [fault for fault, holds in checks.items() if not holds]:
+        if faults := unmet(checks):
             raise BadInputError(f"Dataset {root}: {'; '.join(faults)}.")
         self.root = root
         self._columns = {column.name: column for column in columns}

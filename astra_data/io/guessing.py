@@ -156,7 +156,7 @@ class Logs:
 def guess(paths: Sequence[Path]) -> Logs:
     """Read CSV logs, files with the same fields or folders of them, and guess what their fields are."""
     sources = [Source(file, None, file) for path in paths for file in csv_files(path)]
-    tables = [read_numbers(source) for source in sources]
+    tables, torn = zip(*map(read_numbers, sources), strict=True)
     filled = [[name for name, values in table.items() if np.isfinite(values).any()] for table in tables]
     first = sources[0].path
     for source, names, table in zip(sources, filled, tables, strict=True):
@@ -177,7 +177,7 @@ def guess(paths: Sequence[Path]) -> Logs:
         for one, kept in zip(raw, rows, strict=True)
         if kept.any()
     ]
-    cut_off = tuple(str(source.path) for source in sources if whole_lines(source, str(source.path))[1])
+    cut_off = tuple(str(source.path) for source, is_torn in zip(sources, torn, strict=True) if is_torn)
     logs = Logs(tuple(fields), tuple(scaled), gaps, cut_off)
     for role, example in (("command", "cmd_v"), ("state", "x")):
         if role not in [field.role for field in fields]:
@@ -358,11 +358,14 @@ def plain_name(name: str) -> str:
     return re.sub(r"[^a-z0-9]+", "_", spelled.replace("²", "2").replace("^", "")).strip("_")
 
 
-def read_numbers(source: Source) -> dict[str, Floats]:
-    """Return the fields (T,) of a CSV file as numbers: equal names have the same, other texts and dates are NaN."""
+def read_numbers(source: Source) -> tuple[dict[str, Floats], bool]:
+    """Return the fields (T,) of a CSV file as numbers, and whether its last row is cut off.
+
+    Texts that name episodes become a number each; other texts and dates are NaN.
+    """
     file = str(source.path)
     with explained(file, source):
-        content, _ = whole_lines(source, file)
+        content, is_torn = whole_lines(source, file)
         options = csv.ParseOptions(delimiter=delimiter_of(file))
         table = csv.read_csv(pa.BufferReader(content), parse_options=options)
     if len(table) < 2:
@@ -388,7 +391,7 @@ def read_numbers(source: Source) -> dict[str, Floats]:
         numbers[name] = series
     if not any(np.isfinite(values).any() for values in numbers.values()):
         raise BadInputError(f"{file}: expected rows of numbers below a header")
-    return numbers
+    return numbers, is_torn
 
 
 def logs_of(data: Dataset) -> Logs:

@@ -14,7 +14,7 @@ import numpy as np
 
 from astra_data.core.arrays import Floats
 from astra_data.core.durable import file_digest
-from astra_data.core.errors import AstraDataError, BadInputError, CorruptDatasetError, optional
+from astra_data.core.errors import AstraDataError, BadInputError, CorruptDatasetError, optional, unmet
 from astra_data.dataset import columns as names
 from astra_data.dataset import format as layout
 from astra_data.dataset import plain
@@ -123,7 +123,7 @@ def _info_faults(info: Mapping[str, Any], report: Report) -> list[plain.PlainCol
         f"features is {features!r}, expected an object": isinstance(features, dict),
         f"data_path is {path!r}, {inside}": plain.is_data_path(path),
     }
-    for fault in (fault for fault, holds in checks.items() if not holds):
+    for fault in unmet(checks):
         report.fault(layout.INFO_PATH, f"{layout.INFO_PATH}: {fault}")
     if not isinstance(features, dict) or not all(list(checks.values())[1:]):
         return []
