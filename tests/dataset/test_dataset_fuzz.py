@@ -29,7 +29,7 @@ from astra_data.dataset.inspection import inspect_dataset
 from astra_data.dataset.reader import Dataset
 
 fuzzed = settings(
-    max_examples=int(os.environ.get("ASTRA_DATA_FUZZ", "5")),
+    max_examples=int(os.environ.get("ASTRA_DATA_FUZZ", "10")),
     deadline=None,
     derandomize="ASTRA_DATA_FUZZ" not in os.environ,
     database=None,
