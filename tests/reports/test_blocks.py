@@ -53,6 +53,8 @@ def test_html_escapes_what_anybody_wrote_and_loads_nothing() -> None:
         [blocks.Section(hostile, [text, blocks.TableBlock(hostile, [hostile], [[hostile]]), blocks.Code(hostile)])],
     )
     assert "<script>" not in page and "default-src 'none'" in page
+    cells = blocks.markdown("r", [blocks.Section("s", [blocks.TableBlock("", [hostile], [[f"{hostile}\n# a"]])])])
+    assert "<" not in cells and "\n# a" not in cells
     assert blocks.code("a`b\n# c") == "`ab # c`"
     assert blocks.inline("**Of** `a<b` & *c*") == "<strong>Of</strong> <code>a&lt;b</code> &amp; *c*"
 

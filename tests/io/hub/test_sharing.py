@@ -20,7 +20,7 @@ from astra_data.core.errors import BadInputError, CorruptDatasetError, DiskError
 from astra_data.dataset.reader import Dataset
 from astra_data.io.hub import sharing
 from astra_data.io.hub.sharing import pull, push
-from astra_data.io.hub.stores import RemoteFolder
+from astra_data.io.hub.stores import RemoteFolder, UrlStore
 
 pytestmark = pytest.mark.usefixtures("quick_figure")
 
@@ -219,6 +219,21 @@ def test_folders_in_folders_are_not_listed(shared: Path, tmp_path: Path, monkeyp
     monkeypatch.setattr(LocalFileSystem, "ls", watched)
     pull(source(shared), out=tmp_path / "out")
     assert set(listed) == {str(shared.parent)}
+
+
+def test_of_very_many_folders_few_are_looked_into(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for number in range(sharing.MOST_NAMED + 30):
+        (tmp_path / f"shared/{number}/more").mkdir(parents=True)
+    asked, names = list[str](), UrlStore.names
+
+    def watched(self: UrlStore) -> list[str]:
+        asked.append(self.url)
+        return names(self)
+
+    monkeypatch.setattr(UrlStore, "names", watched)
+    with pytest.raises(SharingError, match="has no dataset of astra-data"):
+        pull(f"file://{tmp_path}/shared", out=tmp_path / "copy")
+    assert len(asked) == sharing.MOST_NAMED + 2  # itself twice
 
 
 def test_no_more_is_fetched_than_is_taken(shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
