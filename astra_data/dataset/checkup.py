@@ -146,10 +146,7 @@ class Clock:
         self.uids.append(uid)
 
     def rates(self) -> tuple[float, int, float, float]:
-        """Return period in s, number of gaps, their share of the steps, and jitter in periods; 0 without a rate.
-
-        The period is the mean of the `INNER` share of steps around the median; 5 % of the steps are off by the jitter.
-        """
+        """Return period in s (mean of the `INNER` steps), number and share of gaps, jitter in periods; or zeros."""
         every = np.concatenate([*self.steps_s, np.zeros(0)])
         steps_s = np.sort(every[every > 0])
         if 2 * len(steps_s) <= len(every):

@@ -26,10 +26,7 @@ Batch = dict[str, Tensor]  # column name to (B, ...)
 
 
 class Order:
-    """Indices (B,) of `count` samples, batch by batch, reshuffled each epoch, by (seed, epoch) alone.
-
-    Iterating goes on from `batch` of `epoch`. It also serves a `DataLoader` as batch_sampler.
-    """
+    """Indices (B,) of `count` samples, batch by batch, reshuffled by (seed, epoch); goes on from `batch` of `epoch`."""
 
     def __init__(
         self, count: int, batch_size: int, *, seed: int = 0, shuffle: bool = True, drop_last: bool = False

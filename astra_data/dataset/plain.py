@@ -170,10 +170,7 @@ def _read_lines(path: Path) -> list[dict[str, Any]] | str:
 
 
 def read_tasks(root: Path) -> dict[int, str] | str:
-    """Return the tasks by their task_index, or what is wrong with meta/tasks.parquet.
-
-    The name of the text column varies: it is the index of a pandas frame. Of format 2, it is a file of JSON.
-    """
+    """Return the tasks by task_index, or what is wrong with their file; the name of the text column varies."""
     if is_format_2(root):
         rows = _read_lines(root / (name := _FORMAT_2["tasks"]))
         if isinstance(rows, str):
@@ -247,11 +244,7 @@ def episode_rows(root: Path) -> Iterator[dict[str, Any]]:
 
 
 def runs(path: Path, tables: Iterator[pa.Table], columns: Sequence[PlainColumn]) -> Iterator[Run]:
-    """Split the rows of one file where episode_index changes and frame_index is 0.
-
-    A single wrong value of either splits nothing, and `run_faults` finds it. Memory holds the longest run and
-    a block.
-    """
+    """Split the rows of one file where episode_index changes and frame_index is 0; `run_faults` finds what is not."""
     rest: dict[str, Array] = {}
     row = 0
     for table in tables:
@@ -294,10 +287,7 @@ def block_values(table: pa.Table, columns: Sequence[PlainColumn]) -> dict[str, A
 
 
 def run_faults(run: Run, *, number: int, row: int, fps: float) -> Iterator[tuple[str, str]]:
-    """Yield (column, sentence) for each column with wrong values of a run that is to be episode `number`.
-
-    `row` is the index of its first row in the dataset.
-    """
+    """Yield (column, sentence) for wrong values of a run, of episode `number` from row `row` of the dataset."""
     uid = run.columns.get(names.EPISODE_UID, [0])[0]
     expected = layout.reserved_values(len(run), uid=uid, episode=number, start=row, fps=fps)
     del expected[names.TASK_INDEX]  # LeRobot's datasets may have several tasks

@@ -13,14 +13,7 @@ LEAST_LATENT_R2 = 0.9  # of a target encoder on held-out episodes, to be deploye
 
 
 class TargetEncoder(nn.Module):
-    """ψ^t: encode histories of full target states into the source encoder's latent space.
-
-    The first two entries of a target state are its planar position in m, which gets the `PositionFeatures`
-    of the source encoder: without them, ψ^t cannot match how ψ^s represents walls. With 0 octaves there are
-    none.
-
-    `sizes` are the arguments that it was made with.
-    """
+    """ψ^t: encode full target states into the source encoder's latents; `sizes` are its arguments."""
 
     def __init__(
         self,
@@ -56,10 +49,7 @@ class TargetEncoder(nn.Module):
         return bool(self.latent_r2 >= LEAST_LATENT_R2)
 
     def set_scales(self, state: Tensor, goal: Tensor, unseen: Sequence[int] = ()) -> None:
-        """Take means and standard deviations from training steps: `state` (N, S), `goal` (N, G).
-
-        The entries `unseen` of states are given an infinite deviation, so that they are always 0 as inputs.
-        """
+        """Take scales of `state` (N, S) and `goal` (N, G); the entries `unseen` are then always 0 as inputs."""
         take_scales(self, {"state": state, "goal": goal})
         self.state_std[list(unseen)] = torch.inf
 
@@ -72,12 +62,7 @@ class TargetEncoder(nn.Module):
 
 
 def gaussian_mmd(mean_1: Tensor, variance_1: Tensor, mean_2: Tensor, variance_2: Tensor, bandwidths: Tensor) -> Tensor:
-    """Return the squared MMD (...) between two diagonal Gaussians (..., Z) in closed form.
-
-    With the kernel k(x, y) = exp(-|x - y|² / 2h²), averaged over the `bandwidths` h, (K,), the mean of k over
-    N(m1, v1) and N(m2, v2) is Π_d sqrt(h² / (h² + v1 + v2)) exp(-(m1 - m2)² / 2(h² + v1 + v2)). h near sqrt(Z)
-    keeps the gradient alive.
-    """
+    """Return the squared MMD (...) of diagonal Gaussians (..., Z) with Gaussian kernels of `bandwidths` (K,)."""
     squared = bandwidths.square().unsqueeze(-1)
     apart = (mean_1 - mean_2).square().unsqueeze(-2)
 

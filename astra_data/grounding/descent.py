@@ -73,10 +73,7 @@ _PATIENCE_SHARE = 0.3  # a fit ends once its held-out error has not fallen for t
 
 
 class Descent:
-    """A fit in progress, with AdamW, after `done` updates.
-
-    Its `points` are measurements, and `stopwatch` includes the time before an interruption.
-    """
+    """A fit by AdamW, after `done` updates; `points` are measurements, `stopwatch` counts earlier sessions too."""
 
     def __init__(
         self, model: nn.Module, config: DescentConfig, *, checkpoint: Path | None = None, weight_decay: float = 0.0
@@ -123,10 +120,7 @@ class Descent:
         self.done += 1
 
     def keep(self, held_out_error: float | None = None, **measured: float | None) -> None:
-        """Add the figures `measured` now to the points, and write the checkpoint.
-
-        The weights are remembered if their `held_out_error` is the least so far; `finish` returns to them.
-        """
+        """Add figures to the points, and write the checkpoint; `finish` returns to the weights of the least error."""
         error = {} if held_out_error is None else {"held_out_error": held_out_error}
         refuse_divergence(f"by update {self.done}", error | measured)
         self.points.append({"step": self.done, **error, **measured})

@@ -14,10 +14,7 @@ _LONGEST_M = 16.0  # longest wavelength of position features
 
 
 def mlp(sizes: tuple[int, ...], activation: type[nn.ELU | nn.ReLU] = nn.ELU, *, inplace: bool = False) -> nn.Sequential:
-    """Build linear layers of `sizes` with `activation` between them.
-
-    `inplace` saves time where batches are (N, size); with more dimensions the gradient takes longer.
-    """
+    """Build linear layers of `sizes` with `activation` between; `inplace` saves time for batches (N, size) only."""
     layers: list[nn.Module] = []
     for size_in, size_out in pairwise(sizes):
         layers += [nn.Linear(size_in, size_out), activation(inplace=inplace)]
@@ -50,10 +47,7 @@ class Members(nn.Module):
 
 
 class PositionFeatures(nn.Module):
-    """Sines and cosines of planar positions, so that a smooth network can place sharp walls.
-
-    Maps (..., 2) in m to (..., 4 * octaves): wavelengths from `_LONGEST_M` down by halves.
-    """
+    """Sines and cosines (..., 4 * octaves) of positions (..., 2) in m, so that smooth networks place sharp walls."""
 
     def __init__(self, octaves: int) -> None:
         super().__init__()
@@ -68,12 +62,7 @@ class PositionFeatures(nn.Module):
 
 
 class Encoder(nn.Module, ABC):
-    """What encodes a history (x_1, x_2, ...) into latents (z_1, z_2, ...), one for each step.
-
-    x_i holds the state s_i and the action a_{i-1} that led to it (zero at the start). What is remembered of a
-    history is an argument and a result, `memory` (B, M), never kept.
-
-    """
+    """Encodes a history of states s_i and actions a_{i-1} into latents; `memory` (B, M) is never kept."""
 
     kind: ClassVar[str]  # names the class in files, see `ENCODERS`
     latent_size: int
@@ -104,11 +93,7 @@ class Encoder(nn.Module, ABC):
 
 
 class HistoryEncoder(Encoder):
-    """A GRU, whose memory is its hidden state, and whose latent is this after a LayerNorm without gain.
-
-    That fixes the length of each latent: the printed latent loss would otherwise shrink it without limit.
-    What keeps different histories apart is the target of that loss.
-    """
+    """A GRU; latents are hidden states after LayerNorm without gain, which a latent loss cannot shrink."""
 
     kind = "gru"
 
@@ -136,10 +121,7 @@ class HistoryEncoder(Encoder):
         return self.latent(states), states
 
     def through_episodes(self, inputs: Tensor, hidden: Tensor, start: Tensor) -> Tensor:
-        """Return the hidden states (B, T, Z) of `inputs` (B, T, I) of several episodes one after another.
-
-        They begin with `hidden` (B, Z). `start` (B, T) is 1 where a new episode begins, from zero.
-        """
+        """Return hidden states (B, T, Z) of `inputs`, from `hidden` (B, Z), or zero where `start` (B, T) is 1."""
         embedded = functional.elu(self.embedding(inputs.transpose(0, 1)))
         (weights,) = self.recurrence.all_weights
         keep = (1.0 - start).t().unsqueeze(-1)
@@ -148,10 +130,7 @@ class HistoryEncoder(Encoder):
 
 
 class _Recurrence(torch.autograd.Function):
-    """A GRU over T steps, whose gradient takes a third of the time that torch's takes on a CPU.
-
-    Backward in time, only what depends on later steps is computed step by step; all else at once.
-    """
+    """A GRU over T steps whose gradient takes a third of torch's time on a CPU: all that can be is done at once."""
 
     @staticmethod
     def forward(

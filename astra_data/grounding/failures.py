@@ -1,9 +1,4 @@
-"""A failure model: the probability that the target fails soon, given the last second.
-
-A robot that is about to fall lags behind its commands, and is close to a wall or on its way there. The latent
-of the history says more where failures are many, and is memorized where they are few: whether the network
-sees it is decided by likelihood on episodes that it was not fitted to.
-"""
+"""A failure model: the probability that the target fails soon, given lags behind commands and walls ahead."""
 
 import copy
 import math
@@ -60,11 +55,7 @@ class FailureShape:
 
 
 class FailureModel(nn.Module):
-    """Estimate the probability of a failure within the shape's `risk_steps`, from before a step is corrected.
-
-    The memory (B, M) is an argument and a result, never kept: the last state, where the simulator had landed,
-    the last action, and the averages.
-    """
+    """Estimate the probability of a failure within `risk_steps`; the memory (B, M) is never kept."""
 
     def __init__(self, shape: FailureShape) -> None:
         super().__init__()
@@ -92,22 +83,14 @@ class FailureModel(nn.Module):
             deviation.copy_(moves[mask].std(0).clamp_min(1e-3))
 
     def initial_memory(self, state: Tensor, previous_action: Tensor, averages: Tensor | None = None) -> Tensor:
-        """Return the memory (n, M) of episodes that start in `state` (n, X).
-
-        `averages` (n, 15) are those of the history before; by default there is none.
-        """
+        """Return the memory (n, M) of episodes from `state` (n, X), with `averages` (n, 15) of before."""
         averages = state.new_zeros(len(state), _AVERAGES) if averages is None else averages
         return torch.cat([state, state, previous_action, averages], dim=-1)
 
     def inputs(
         self, state: Tensor, action: Tensor, landed: Tensor, latent: Tensor | None, memory: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return what the networks see of a step, (B, I), and the next memory (B, M).
-
-        That are magnitudes: how far the simulator would move from s_i to where it `landed`, (B, X), how far the
-        target moved, how far that was from where the simulator had landed; the change of the action, and the
-        action. Then their averages, distances from walls in a maze, and the latent.
-        """
+        """Return what networks see of a step, (B, I), and the next memory (B, M); simulators `landed` (B, X)."""
         before, landed_before, action_before, averages = memory.split(self._parts, dim=-1)
         wanted, moved, missed = landed - state, state - before, state - landed_before
         moves = (wanted / self.wanted_std, moved / self.moved_std, missed / self.missed_std)
@@ -137,10 +120,7 @@ class FailureModel(nn.Module):
         return (self.log_odds(inputs) + self.log_odds_shift).sigmoid().mean(0)
 
     def log_odds(self, inputs: Tensor) -> Tensor:
-        """Return the log-odds (K, ...) by each member for `inputs` (..., I).
-
-        Failures are drawn more often than they come: `log_odds_shift` is not added yet.
-        """
+        """Return log-odds (K, ...) by each member for `inputs` (..., I), without `log_odds_shift`."""
         return torch.as_tensor(self.members(normalized(inputs, self.input_mean, self.input_std)))
 
     def hazard(self, probability: Tensor) -> Tensor:
@@ -152,11 +132,7 @@ _MOST_FOLDS = 5
 
 
 def folds(fails: Tensor, recordings: Tensor) -> list[Tensor]:
-    """Split episodes at random, those that fail (E,) and the others alike; return who is in each fold, (E,).
-
-    Copies stay with the episode that they are of: `recordings` (E,) are the same for them. There are as many
-    folds as recordings with a failure, at most five; none with a single one.
-    """
+    """Split episodes (E,) at random by `recordings` (E,), those that fail alike; return who is in each of 5 at most."""
     # Numbered as they come, so that without copies each episode is drawn for in turn.
     known: dict[int, int] = {}
     numbered = [known.setdefault(name, len(known)) for name in recordings.tolist()]
@@ -172,11 +148,7 @@ def folds(fails: Tensor, recordings: Tensor) -> list[Tensor]:
 
 
 def calibration(odds: Tensor, fails: Tensor, risk_steps: int) -> tuple[Tensor, Tensor]:
-    """Return by how much to scale and shift log-odds (K, N) so that they come true on steps (N,) (Platt).
-
-    The logarithm of the scale has a standard normal prior, and the `risk_steps` before a failure count as one
-    step: where failures are few, little is changed.
-    """
+    """Return scale and shift of log-odds (K, N) that come true (Platt); log-scales have a standard normal prior."""
     odds, fails = odds.double(), fails.double().expand_as(odds)
     start = [torch.zeros((), device=odds.device), fails.mean().logit() - odds.mean()]
     scale, shift = (one.double().clone().requires_grad_() for one in start)
@@ -204,13 +176,7 @@ BINS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # edges of the probabilities
 
 
 def failing(task: Task, episodes: PairedEpisodes, risk_steps: int = FAILURE_STEPS) -> PairedEpisodes:
-    """Return the episodes with what a failure model learns of them as `fails_soon`.
-
-    That is the last `risk_steps` before a failure that no abstract state shows. Where one does, as with a
-    ball beside the goal, simulators end episodes themselves, and a failure model would end them twice. A
-    touch of a wall is learned: where a simulated body touches one, the robot's often does not, and the other
-    way round.
-    """
+    """Return the episodes with the last `risk_steps` before a failure that no abstract state shows as `fails_soon`."""
     windows, last = episodes.windows, episodes.lengths - 1
     each = torch.arange(len(episodes), device=last.device)
     is_shown = task.objective.missed(windows.next_state[each, last], windows.goal[each, last])
@@ -227,15 +193,7 @@ def has_failures(task: Task, episodes: PairedEpisodes) -> bool:
 def fit_failures(
     task: Task, grounding: Grounding, training: PairedEpisodes, seed: int
 ) -> tuple[FailureModel, dict[str, Any]]:
-    """Fit a failure model to replays of whole episodes, calibrated by cross-fitting.
-
-    It sees the latent if this makes the moments of failures likelier in cross-fitting. The episodes are such
-    that `has_failures`.
-
-    Returns:
-        the model; and "latent", whether it sees the latent, and "candidates" with their log-likelihood in
-        nats per failure over a constant rate, None where a single recording fails.
-    """
+    """Fit a failure model to replays, calibrated by cross-fitting, with the latent if that makes failures likelier."""
     torch.manual_seed(derive(seed, "failure model"))
     episodes = failing(task, training)
     seen = replayed_inputs(task, grounding, _untrained(task, grounding, training, sees_latent=True), training)
@@ -265,11 +223,7 @@ def fit_failures(
 def _cross_fitted(
     untrained: FailureModel, episodes: PairedEpisodes, inputs: Tensor, divided: Sequence[Tensor]
 ) -> tuple[float, Tensor, Tensor] | None:
-    """Predict each fold's episodes by the others, from `inputs` (E, T, I).
-
-    Returns the log-likelihood of the failures' moments, of the hazard at every step over a constant one, in
-    nats per failure, and the scale and shift of log-odds by which it is calibrated; None without folds.
-    """
+    """Predict each fold by the others; return nats per failure over a constant hazard, and the calibration."""
     windows, predicted = episodes.windows, []
     for fold in divided:
         others = episodes.select((~fold).nonzero().squeeze(1))
@@ -339,12 +293,7 @@ def _drawn(rows: Tensor, count: int) -> Tensor:
 
 @torch.no_grad()
 def replayed_inputs(task: Task, grounding: Grounding, failures: FailureModel, episodes: PairedEpisodes) -> Tensor:
-    """Return what a failure model sees of each step, (E, T, I), where recorded commands are simulated.
-
-    The simulator moves more smoothly than the target, so that a failure announces itself less. Replays of
-    `_REPLAYED` steps begin at every `RISK_STEPS`-th recorded moment. What is seen of a step is from the one
-    that began longest before it: nearly all that the averages remember is simulated then.
-    """
+    """Return what is seen of each step (E, T, I) in simulated replays, by the one that began longest before it."""
     windows = episodes.windows
     moments = Moments.every(windows, RISK_STEPS)
     simulator = grounding.simulator(task, len(moments), str(windows.mask.device))
@@ -390,15 +339,7 @@ def failure_figures(
 def failure_skill(
     probability: Tensor, episodes: PairedEpisodes, ahead: Sequence[tuple[int, int]] = AHEAD_STEPS
 ) -> dict[str, Any]:
-    """Measure probabilities (E, T) of what `fails_soon` marks on episodes that were not fitted.
-
-    Returns:
-        "failures": of the episodes. "auc": by window `ahead` of the failure, the probability that a step
-        there is ranked above one with no failure up to the end of the last; None without such steps.
-        "brier_skill": the share of the squared error of always saying the rate that is removed, None where
-        there is no such error. "reliability": predicted and observed rate, and number of steps, by predicted
-        probability. All but the first None without failures.
-    """
+    """Measure probabilities (E, T) of `fails_soon`: AUC by window `ahead`, Brier skill, reliability by bin."""
     windows = episodes.windows
     mask = windows.mask.bool()
     fails = windows.fails_soon.bool() & mask

@@ -149,11 +149,7 @@ class HistoryFit:
 
 
 def with_own_rewards(task: Task, episodes: PairedEpisodes) -> PairedEpisodes:
-    """Add the task's own rewards on abstract states to the windows of `episodes`.
-
-    Where abstract states show that the goal is reached, or out of reach, there is no reward to predict, and
-    no failure: there the simulator ends the episode and pays, and R_pred is not used.
-    """
+    """Add the task's rewards on abstract states; where these show an end, R_pred learns nothing, as it is not used."""
     windows, objective = episodes.windows, task.objective
     before, after, goal = (values.flatten(0, 1) for values in (windows.state, windows.next_state, windows.goal))
     shown = objective.decided(after, goal)
@@ -206,10 +202,7 @@ _CLOSEST_SHARE = 0.01  # of the recorded steps: those that were closer to a wall
 
 
 def recorded_clearance_m(task: Task, episodes: PairedEpisodes) -> float | None:
-    """Return the distance in m from walls that 99 of 100 steps kept, also of copies; None without walls.
-
-    It is that of cells of the maze's fine grid, so up to one too large: 98 of 100 steps are as far away.
-    """
+    """Return the distance in m from walls that 99 % of steps kept, up to a fine cell too large; None without walls."""
     if task.plane is None:
         return None
     positions = episodes.steps(episodes.windows.state)[:, :2].numpy(force=True)

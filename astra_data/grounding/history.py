@@ -21,10 +21,7 @@ _FAILURES, _SCATTER = "failures", "scatter"
 
 
 class GroundedSimulator(EpisodeSimulator):
-    """Step the simulator, correct where it landed, set it there, and encode the longer history.
-
-    `hidden` (B, M) is the memory of the encoder.
-    """
+    """Step the simulator, correct where it landed, set it there; `hidden` (B, M) is the encoder's memory."""
 
     def __init__(self, simulator: PlacedSimulator, grounding: "HistoryGrounding") -> None:
         """Wrap `simulator`."""
@@ -63,10 +60,7 @@ class GroundedSimulator(EpisodeSimulator):
         hidden: Tensor | None = None,
         previous_action: Tensor | None = None,
     ) -> None:
-        """Start episodes in `rows` (n,); see `EpisodeSimulator.start`.
-
-        `hidden` is that of the encoder, followed by the averages of the failure model, if they are known.
-        """
+        """Start as `EpisodeSimulator` does; after `hidden` may come the averages of the failure model."""
         super().start(state, rows, goal)
         if self._touches is not None:
             self._touches = self._touches.index_fill(0, rows, False)

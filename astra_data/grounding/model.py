@@ -1,7 +1,4 @@
-"""ASTRA's grounding model: history encoder, latent dynamics, reward, correction; and their joint loss.
-
-Paper, Section IV-A. With the weights (0, 0, 1) it is NAS in the paper's sense: only the correction is fitted.
-"""
+"""ASTRA's grounding model and its joint loss (paper, Section IV-A); with weights (0, 0, 1) it is the paper's NAS."""
 
 import copy
 from dataclasses import dataclass
@@ -45,11 +42,7 @@ class GroundingShape:
 
 
 class GroundingModel(nn.Module):
-    """ψ^s, P_lat, R_pred and f_abs on one GRU backbone.
-
-    Scales are buffers, so checkpoints hold them; `take_scales` and `set_reward_scales` take them from the
-    training episodes.
-    """
+    """ψ^s, P_lat, R_pred and f_abs on one history encoder; scales are buffers, so that files hold them."""
 
     def __init__(self, shape: GroundingShape) -> None:
         super().__init__()
@@ -76,12 +69,7 @@ class GroundingModel(nn.Module):
 
     @torch.no_grad()
     def set_reward_scales(self, reward: Tensor, known: Tensor, failed: Tensor) -> None:
-        """Take the scales of rewards (N, R) from training steps; `known` and `failed` are (N,), 0 or 1.
-
-        R is 2, the reward and the residual reward, or 1 without the latter. Means and deviations are those of
-        steps whose reward R_pred learns (`known`). A failure costs the mean of the last reward of steps that
-        `failed`, less its mean.
-        """
+        """Take scales of rewards (N, R), from `known` steps (N,), and the cost of a failure, from `failed` ones."""
         known, failed = known.bool(), failed.bool()
         if known.any():
             self.reward_mean.copy_(reward[known].mean(0))
@@ -92,11 +80,7 @@ class GroundingModel(nn.Module):
 
     @torch.no_grad()
     def shrink_reward(self, windows: PairedWindows) -> None:
-        """Shrink predicted residual rewards as far as they explain those of held-out `windows`.
-
-        The factor is the slope of the recorded on the predicted residuals, within 0 and 1: a prediction that
-        explains nothing pays nothing, and a policy cannot live on its errors.
-        """
+        """Shrink predicted residuals by the slope of held-out on predicted ones, so that errors pay nothing."""
         latent, _ = self.encode(windows)
         known = windows.goes_on.bool()
         predicted = self.rewards(latent, windows.action)[known][:, -1]
@@ -132,10 +116,7 @@ class GroundingModel(nn.Module):
         return mean, low + (high - low) * torch.sigmoid(raw)
 
     def target_reward(self, latent: Tensor, action: Tensor, own: Tensor, hazard: Tensor | None = None) -> Tensor:
-        """Return the target's reward (...) of a step, given the task's `own` (...) on abstract states.
-
-        A `hazard` (...), the probability that the step fails by a failure model, adds what failures cost.
-        """
+        """Return the target's reward (...), given the task's `own`, less what a `hazard` (...) of failure costs."""
         predicted = self.predict_reward(latent, action)
         if self.shape.corrects_reward:
             predicted = predicted + own
@@ -197,10 +178,7 @@ class GroundingModel(nn.Module):
 
     @torch.no_grad()
     def _following_latent(self, inputs: Tensor) -> Tensor:
-        """Return the latents (B, T - 1, Z) of the next steps, by a slow copy of the encoder.
-
-        With the encoder itself the loss is unbounded below: it can predict a constant latent exactly.
-        """
+        """Return the next latents (B, T - 1, Z) by the slow encoder; else a constant would be best."""
         return self.target_encoder.sequence(inputs)[0][:, 1:]
 
 
@@ -218,13 +196,7 @@ def _masked_mean(values: Tensor, mask: Tensor) -> Tensor:
 
 @torch.no_grad()
 def telemetry(model: GroundingModel, episodes: PairedEpisodes, weights: LossWeights) -> dict[str, float | None]:
-    """Return figures that losses do not show, on `episodes`.
-
-    They are: R² of each head that is trained (for the correction: the share of the simulator's error that it
-    removes), None where there is no variance to explain, as in a perfect simulator; the mean standard
-    deviation of the latent's entries; and the latent's effective rank (exponential of the entropy of the
-    normalized eigenvalues of its covariance); both None for a single step.
-    """
+    """Return R² of each trained head on `episodes`, None without variance, and the latent's deviation and rank."""
     windows = episodes.windows
     latent, _ = model.encode(windows)
     mask = windows.mask.bool()
@@ -252,11 +224,7 @@ def telemetry(model: GroundingModel, episodes: PairedEpisodes, weights: LossWeig
 
 
 def correction_r2(corrected: Tensor, windows: PairedWindows, std: Tensor) -> float | None:
-    """Return the share of the simulator's squared error, in units of `std` (X,), that a correction removes.
-
-    `corrected` (B, T, X) are the corrected simulated next states of `windows`. None where the simulator makes
-    no error.
-    """
+    """Return the share of squared error in units of `std` (X,) that `corrected` (B, T, X) removes, if there is any."""
     mask = windows.mask.bool()
     landed = (corrected, windows.simulated_next)
     wrong, raw = (((one - windows.next_state) / std)[mask].square().sum() for one in landed)

@@ -25,15 +25,7 @@ def distances(task: Task, error: Tensor) -> Tensor:
 
 @torch.no_grad()
 def gap_report(task: Task, grounding: Grounding, episodes: PairedEpisodes, *, seed: int) -> dict[str, Any]:
-    """Replay the actions of `episodes` open loop in both simulators and compare with the target.
-
-    Beside them, under "still", is the error of the persistence baseline: the robot stays where it is.
-
-    For each horizon, starts are drawn from all steps that have so many after them, one for every 25, with a
-    grounding's memory of the true history up to there. Errors are distances in the task's quantities after 1,
-    10, 50 and 200 steps: means and 95 % bootstrap intervals over episodes; None where a single episode is
-    that long.
-    """
+    """Replay recorded actions open loop in both simulators; return errors of 1 to 200 steps, with intervals."""
     torch.manual_seed(derive(seed, "gap noise"))
     windows, lengths = episodes.windows, episodes.lengths.cpu().numpy()
     device, drawing = windows.state.device, generator(seed, "gap starts")
@@ -72,11 +64,7 @@ def gap_report(task: Task, grounding: Grounding, episodes: PairedEpisodes, *, se
 def _starts(
     lengths: NDArray[np.int64], horizon: int, rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Draw the episode and the first step, (N,) each, of replays of `horizon` steps.
-
-    In an episode each step with so many after it is equally likely, and there is a replay for every
-    `_START_EVERY` of them, spread evenly.
-    """
+    """Draw episode and first step, (N,) each, of replays of `horizon` steps: one in each `_START_EVERY` starts."""
     possible = np.maximum(lengths - horizon + 1, 0)
     counts = -(-possible // _START_EVERY)
     episode = np.repeat(np.arange(len(lengths)), counts)
@@ -142,10 +130,7 @@ class Moments:
 
 @torch.no_grad()
 def replay_open_loop(task: Task, grounding: Grounding, episodes: PairedEpisodes, *, seed: int) -> Tensor:
-    """Replay whole `episodes` in the simulator of `task` as `grounding` corrects it, without scatter.
-
-    Returns φ(s_0) and where each of T steps ended, (E, T + 1, X); what comes after an episode is void.
-    """
+    """Replay whole `episodes` as `grounding` corrects them, without scatter; return states (E, T + 1, X)."""
     windows, device = episodes.windows, str(episodes.windows.state.device)
     torch.manual_seed(derive(seed, "open-loop replay"))
     episode = torch.arange(len(episodes), device=device)

@@ -64,13 +64,9 @@ def before_failures(fails: Tensor, mask: Tensor, steps: int) -> Tensor:
 
 
 def draw_steps(lengths: Tensor, count: int, length: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Draw windows of `length` steps, each step equally likely; from torch's global generator.
+    """Draw windows of `length` steps, each step equally likely, shifted inside their episodes, whose ends matter.
 
-    A window that is drawn across an end of its episode is shifted inside. Otherwise the last steps, where
-    robots fall, would hardly be seen. No window is longer than the longest episode.
-
-    Returns episodes (count, 1) and steps (count, length) of the windows, and which steps were drawn before the
-    shift, (count, length) bool. In episodes shorter than `length` some lie beyond the end.
+    Returns episodes (count, 1), steps (count, length), and which of them were drawn before the shift.
     """
     length = min(length, int(lengths.max()))
     beginnings = lengths + length - 1
@@ -108,11 +104,7 @@ class PairedEpisodes:
 
     @classmethod
     def load(cls, root: str | Path, device: str = "cpu") -> "PairedEpisodes":
-        """Read the paired dataset at `root`; actions become multiples of ±1 within the task's bounds.
-
-        A terminated last step whose next state was made up, as it is its own, is no step of the robot: its
-        reward, termination and success become those of the step before.
-        """
+        """Read the paired dataset at `root`, actions as ±1; a last step that was made up joins the one before."""
         dataset = open_dataset(root)
         if ABSTRACT_STATE not in dataset.features:
             raise BadInputError(f"{root} has no column {ABSTRACT_STATE}: expected a dataset that was paired")
@@ -204,10 +196,7 @@ class PairedEpisodes:
         return replace(self, windows=_gather(self.windows, episodes), **given)
 
     def split(self, held_out_share: float, seed: int) -> tuple["PairedEpisodes", "PairedEpisodes"]:
-        """Split into training and held-out episodes, as the dataset marks them, else at random.
-
-        At random, `held_out_share` of the recordings are held out, each with its copies.
-        """
+        """Split into training and held-out episodes: as marked, else a share of recordings, with copies."""
         if self.held_out is not None:
             if self.held_out.all():
                 raise BadInputError(
@@ -231,10 +220,7 @@ class PairedEpisodes:
         return values[self.windows.mask.bool()]
 
     def draw_windows(self, count: int, length: int) -> tuple[PairedWindows, Tensor]:
-        """Draw windows (count, length, ...) with `draw_steps`, and their target states (count, length, S).
-
-        The mask marks only the steps that were drawn.
-        """
+        """Draw windows, masked to the drawn steps, and their target states (count, length, S)."""
         episodes, steps, is_drawn = draw_steps(self.lengths, count, length)
         windows = _gather(self.windows, (episodes, steps))
         return replace(windows, mask=windows.mask * is_drawn), self.target_state[episodes, steps]

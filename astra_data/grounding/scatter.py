@@ -1,8 +1,4 @@
-"""What a correction leaves unexplained: how large it is at a moment, and in which forms it comes.
-
-An abstract state does not tell where in its gait a robot is, so the next one is scattered whoever predicts
-it: little while the robot walks steadily, much after a change of the command, and now and then by a stumble.
-"""
+"""What a correction leaves unexplained, such as where in its gait a robot is: its size at a moment, and its forms."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -71,13 +67,7 @@ _MOST_FORMS = 20_000
 def fit_scatter(
     model: GroundingModel, training: PairedEpisodes, held_out: PairedEpisodes, seed: int
 ) -> tuple[ScatterModel, dict[str, Any]]:
-    """Fit scales to the residuals of the training episodes; take the forms from held-out ones.
-
-    Returns:
-        the scatter model, and its figures on held-out steps, of the entries that scatter: "gain_nats", of the
-        log-likelihood of a step over scatter of one size; "kurtosis", of the forms, 3 for a Gaussian, None
-        where nothing scatters.
-    """
+    """Fit scales to the training residuals, take forms from held-out ones; return model and its figures on these."""
     inputs, residual = _residuals(model, training)
     seen, unexplained = _residuals(model, held_out)
     forms = min(len(seen), _MOST_FORMS)

@@ -14,10 +14,7 @@ from astra_data.worlds.variation import Variation, VariedSimulator
 
 
 class EpisodeSimulator:
-    """B abstract simulators. As it is, steps are the simulator's own; subclasses correct where they land.
-
-    The parameters of a `VariedSimulator` are redrawn for each episode.
-    """
+    """B abstract simulators, varied ones redrawn for each episode; subclasses correct where they land."""
 
     latent_size: int = 0  # Z, of the latents that policies observe; 0 where there are none
     landed: Tensor  # where the simulator landed in the last step, before any correction, (B, X)
@@ -58,11 +55,7 @@ class EpisodeSimulator:
         hidden: Tensor | None = None,
         previous_action: Tensor | None = None,
     ) -> None:
-        """Start episodes in `rows` (n,), either new ones or within a known history.
-
-        Then `hidden` (n, H) is what the grounding remembers of it before `state` (n, X), by default nothing, and
-        `previous_action` (n, A) what led there, by default zero.
-        """
+        """Start episodes in `rows` (n,), new ones or within a history: `hidden` (n, H), `previous_action` (n, A)."""
         self.simulator.reset_to(state, rows)
         varied = self._varied
         if varied is not None:
@@ -82,10 +75,7 @@ class EpisodeSimulator:
         return None
 
     def predicted_reward(self, own: Tensor) -> Tensor | None:
-        """Return the target's reward (B,) of the last step as predicted; None where nothing predicts it.
-
-        `own` (B,) is the task's reward on abstract states, to which residual rewards are added.
-        """
+        """Return the target's reward (B,) as predicted, given the task's `own`; None where nothing does."""
         return None
 
     def state_dict(self) -> dict[str, Tensor]:
@@ -137,10 +127,7 @@ class Grounding(Protocol):
         return self.corrected(task.varied_simulator(num_envs, variation, device))
 
     def hidden_before(self, windows: PairedWindows, every: int = 1) -> Tensor | None:
-        """Return its memory before each `every`-th step, (E, ceil(T / every), H); None if it has none.
-
-        Histories begin where `windows` (E, T, ...) do.
-        """
+        """Return its memory before each `every`-th step, (E, ceil(T / every), H); None if it has none."""
         return None
 
     def for_replay(self) -> "Grounding":

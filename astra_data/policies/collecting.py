@@ -128,10 +128,7 @@ class RandomCommands:
 
 
 class StressCommands(RandomCommands):
-    """Commands that seek failures: at the bounds, half of them the reverse of the one before.
-
-    Times of holding are log-uniform, so that short and long ones are alike frequent.
-    """
+    """Commands that seek failures: at the bounds, half of them reversed, held for log-uniform times."""
 
     def _proposed(self, due: NDArray[np.intp], choices: int) -> NDArray[np.float64]:
         drawn = super()._proposed(due, choices)
@@ -192,12 +189,7 @@ def record(
     seed: int,
     progress: Progress,
 ) -> int:
-    """Record the episodes `rows` as one batch, staging each when it ends; return the number of steps.
-
-    `env` has been reset, with a row for each, `behavior` started on them, and `seed` is what the episodes are
-    said to be of. Random numbers are drawn for the whole batch, so episodes that are staged already are
-    simulated again, with the same outcome, but not written again.
-    """
+    """Record the episodes `rows` as one batch, staging each new one when it ends; return the number of steps."""
     active, began = torch.ones(len(rows), dtype=torch.bool), time.perf_counter()
     columns, steps = dict[str, Array](), 0
     for step in range(max_steps):
@@ -254,10 +246,7 @@ _TEST_EPISODES = 32  # test episodes after each iteration
 def suboptimal_by_ppo(
     task: Task, *, steps: int, seed: int, folder: Path, num_threads: int | None, progress: Progress
 ) -> tuple[PolicyFile, Metadata]:
-    """Train a policy without memory by PPO in the target, on φ of its state; stop after `steps`.
-
-    A checkpoint in `folder` lets the same call resume after an interruption. Returns how it was trained as well.
-    """
+    """Train a policy without memory on φ of the target's state, for `steps`; resume from a checkpoint in `folder`."""
     torch.manual_seed(derive(seed, "suboptimal policy"))
     world = ObservedTargetEnv(task, _PPO_ENVS, num_threads=num_threads)
     policy = ActorCritic(ActorCriticShape(world.observation_size, world.action_size))
@@ -273,10 +262,7 @@ def suboptimal_by_ppo(
 def suboptimal_by_sac(
     task: Task, *, steps: int, episode_steps: int, seed: int, folder: Path, num_threads: int | None, progress: Progress
 ) -> tuple[PolicyFile, Metadata]:
-    """Train a policy without memory by SAC in the target, on its full state.
-
-    Stop as soon as episodes last `episode_steps` on average, after `steps` at the latest; otherwise as by PPO.
-    """
+    """Train one on the full state, until episodes last `episode_steps` on average, or for `steps`."""
     if not task.objective.is_lasting:
         raise BadInputError(f"in {task.name} good episodes are short: use 'suboptimal_ppo'")
     torch.manual_seed(derive(seed, "suboptimal policy"))
@@ -324,10 +310,7 @@ def _trained(
 
 
 def _lasts(running: RunningPolicy, seed: int, num_threads: int | None) -> float:
-    """Return how many steps episodes last on average with actions drawn from the policy.
-
-    Training episodes would underestimate it: they began when the policy was worse.
-    """
+    """Return how many steps episodes of the policy last on average: more than those of its training."""
     behavior, task = PolicyBehavior(running), running.task
     env = task.target(_TEST_EPISODES, seed=derive(seed, "starts"), num_threads=num_threads)
     env.reset()

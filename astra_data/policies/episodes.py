@@ -125,10 +125,7 @@ def started(policy: RunningPolicy, act: Act, goal: Tensor) -> Act:
 def in_simulator(
     world: SimulatorEnv, begin: Begin, horizon: int, seed: int, asked: RecordedRange | None = None
 ) -> tuple[Outcome, dict[str, Tensor]]:
-    """Run an episode in each row of `world`; `asked` counts commands beyond what was recorded.
-
-    Returns the outcome, and the starts and goals, which are the same in every simulator.
-    """
+    """Run an episode in each row of `world`; return outcomes, and starts and goals, which are the seed's."""
     torch.manual_seed(seed)
     world.reset()
     act = begin(world.goal)
@@ -148,11 +145,7 @@ def in_simulator(
 
 
 class ObservedTargetEnv:
-    """B target environments whose observation (B, O) is made of their state and the goal.
-
-    The physics runs on the CPU, whatever the device of observations and actions. All randomness comes from
-    torch's global generator.
-    """
+    """B target environments that show their state and goal; physics on the CPU, randomness of torch."""
 
     penalty_scale = 1.0  # without effect, as there are no penalties here
 
@@ -167,11 +160,7 @@ class ObservedTargetEnv:
         device: str = "cpu",
         num_threads: int | None = None,
     ) -> None:
-        """Build B environments.
-
-        A share of the episodes start from `starts`, N recorded states (N, S) and goals (N, G). The physics has
-        `num_threads`, by default one per core.
-        """
+        """Build B; a share of their episodes start from `starts`, N recorded states (N, S) and goals (N, G)."""
         self.num_envs = num_envs
         self.action_size = task.objective.action_size
         self._task, self._observed, self._device = task, observed, device
@@ -233,11 +222,7 @@ def in_target(
     progress: Progress = silent,
     asked: RecordedRange | None = None,
 ) -> TargetEpisodes:
-    """Run so many episodes side by side; starts and goals depend on the seed alone.
-
-    `leg_scale` is a factor on the legs' length, of tasks with the fact `leg_scale`: the ant's. The physics has
-    `num_threads`, by default one per core; the outcome is the same with any number.
-    """
+    """Run so many episodes side by side, with any `num_threads`; `leg_scale` is a factor on the ant's legs."""
     if leg_scale != 1.0 and "leg_scale" not in task.facts:
         raise BadInputError(
             f"leg_scale: the robot of {task.name} has one length of legs: expected 1, got {leg_scale:g}"
@@ -268,11 +253,7 @@ def in_target(
 
 
 def judged_success(task: Task, judge: Grounding, policy: RunningPolicy, episodes: int, seed: int) -> float:
-    """Return the share of so many episodes in which a policy succeeds; starts and goals are of `seed`.
-
-    They are run in the simulator of a `judge`, a grounding of other episodes, whose failure model, if it has
-    one, ends episodes.
-    """
+    """Return the share of episodes that succeed in the simulator of a `judge`, whose failure model ends episodes."""
     world = SimulatorEnv(task.objective, judge.simulator(task, episodes), draws_failures=True)
     outcome, _ = in_simulator(world, partial(started, policy, policy.act_in_simulator), task.objective.horizon, seed)
     return fmean(outcome.success)

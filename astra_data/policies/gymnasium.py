@@ -1,10 +1,6 @@
 """Gymnasium adapters of the batched environments of any task: an `Env` of one robot, a `VectorEnv` of B.
 
-Observations (O,) are those that policies are given: in a simulator the latent, if it has one, and what the
-task's objective shows of the abstract state and the goal; in a target the state and the goal. Actions (A,)
-are in [-1, 1] along each axis; `task.limits.in_units` returns them in the units of the robot's commands.
-`info` has whether the step reached the goal ("success"), whether it was a failure ("failed"), and whether it
-touched a wall ("wall_contact"; never, where there are none).
+Actions (A,) are ±1 along each axis; `info` says whether the step reached the goal, failed or touched a wall.
 """
 
 from typing import Any
@@ -99,10 +95,7 @@ class SingleEnv(gymnasium.Env[Array, Array]):
 
 
 class BatchedVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
-    """All rows of a batched environment; a finished one starts anew in the same step.
-
-    Its last observation and info are in the infos "final_obs" and "final_info", as in `SyncVectorEnv`.
-    """
+    """All rows of a batched environment; a finished one starts anew in the same step, as in `SyncVectorEnv`."""
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012 - as Gymnasium declares it
 

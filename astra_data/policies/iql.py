@@ -1,9 +1,7 @@
 """Implicit Q-learning (Kostrikov et al. 2022) from recorded episodes.
 
-As in their Algorithm 1 the critics come first, from single transitions; then the policy is extracted by
-advantage-weighted regression, from windows, so that a recurrent policy learns with its memory. The critics see no
-history: recorded random commands are held for a while, and critics that know the last one learn little of others.
-Every update seeds torch from (seed, update), so that a resumed run gives the same result.
+Critics learn first, from transitions, since they would learn little from histories of held commands; then the policy,
+by advantage-weighted regression, from windows, so that it learns with its memory.
 """
 
 import copy

@@ -27,18 +27,7 @@ class Taken(NamedTuple):
 
 
 class Learner(ABC):
-    """A training in progress, in B rows of an environment.
-
-    Every iteration seeds torch from (seed, iteration): a training that resumes from a checkpoint repeats what
-    an uninterrupted one would have done, where the environment can be restored.
-
-    Attributes:
-        observation: (B, O), to act on next. first: whether an episode begins with it, (B,) bool.
-        previous_action: (B, A) in ±1. hidden: the policy's memory, (B, H). Both are zero at the start.
-        world_seconds: the time that the environment's steps took, since the start or since resuming.
-        share: of the training that is done, from 0 to 1, which schedules follow.
-        pace: of the training; at 2 it ends after half of the steps that are left.
-    """
+    """A training in progress in B rows; iterations are seeded by their number, so that a resumed one repeats them."""
 
     def __init__(
         self,
@@ -55,13 +44,15 @@ class Learner(ABC):
         """Start all rows, with the policy's memory `hidden` (B, H); `parts` are all else that learning changes."""
         self.env, self.horizon = env, horizon
         self.total_steps, self.rollout_steps, self.steps = total_steps, rollout_steps, 0
-        self.share, self.pace, self.world_seconds = 0.0, 1.0, 0.0
+        # Of the training that is done, which schedules follow; at a pace of 2 half of the steps that are left remain.
+        self.share, self.pace = 0.0, 1.0
+        self.world_seconds = 0.0  # that the environment's steps took, since the start or since resuming
         self._parts, self._seed, self._iteration = parts, seed, 0
-        self.observation = env.reset()
+        self.observation = env.reset()  # to act on next
         device = self.observation.device
         self.previous_action = torch.zeros(env.num_envs, env.action_size, device=device)
         self.hidden = hidden
-        self.first = torch.ones(env.num_envs, dtype=torch.bool, device=device)
+        self.first = torch.ones(env.num_envs, dtype=torch.bool, device=device)  # whether an episode begins with it
         self.lasted = torch.zeros(env.num_envs, dtype=torch.int64, device=device)
         self.age = torch.randint_like(self.lasted, horizon) if is_staggered else self.lasted
         self._forget()
@@ -157,10 +148,7 @@ def is_mastered(points: Points) -> bool:
 
 
 def penalty_scale(points: Points) -> float:
-    """Return the factor on penalties, from 0 to 1, after the `points` of a learning curve.
-
-    It grows while the simulator is mastered and falls as fast while not: at full size at once, robots learn to stand.
-    """
+    """Return the factor on penalties (0 to 1) after `points`: grows while mastered, else falls; else robots stand."""
     scale, before = 0.0, 0.0
     for number, point in enumerate(points, 1):
         now = float(point["share"] or 0.0)

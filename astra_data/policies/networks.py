@@ -42,10 +42,7 @@ class PolicyShape:
 def features_of(
     memory: HistoryEncoder | None, observation: Tensor, previous_action: Tensor, hidden: Tensor, start: Tensor
 ) -> Tensor:
-    """Return the features (B, T, F) of `observation` (B, T, O), (B, T, A), from `hidden` (B, M).
-
-    `start` (B, T) is 1 where a new episode begins: there the memory is set to zero.
-    """
+    """Return the features (B, T, F) of (B, T, ...), from `hidden` (B, M), which is zero where `start` (B, T) is 1."""
     if memory is None:
         return observation
     inputs = torch.cat([observation, previous_action], dim=-1)
@@ -58,10 +55,7 @@ def gaussian_log_prob(mean: Tensor, std: Tensor, value: Tensor) -> Tensor:
 
 
 class Policy(nn.Module, ABC):
-    """Acts on observations and its memory of them.
-
-    The memory is an argument and a result, `hidden` (B, M), never kept; without memory M = 0.
-    """
+    """Acts on observations and its memory of them, an argument and a result, `hidden` (B, M), never kept."""
 
     squashes: ClassVar[bool] = False  # whether actions are the tanh of draws from the Gaussian that `policy` returns
 
@@ -110,10 +104,7 @@ class ActorCriticShape(PolicyShape):
 
 
 def bounded(output: Tensor) -> Tensor:
-    """Return the mean actions (..., A) of an actor's `output`, clipped to ±1 with the gradient of the output.
-
-    A tanh is flat far out: once a policy pushes against a wall at full speed, it hardly learns to turn.
-    """
+    """Return `output` clipped to ±1, with its gradient: tanh is flat where policies push against walls."""
     return output + (output.clamp(-1.0, 1.0) - output).detach()
 
 
@@ -249,11 +240,7 @@ class HistoryEstimate(nn.Module):
 
 
 class Student(ActorCritic):
-    """Actor and critic with extrinsics that are estimated from the last H observations and actions.
-
-    The hidden state is the memory (B, M) followed by the history (B, H * (O + A)): each row holds an
-    observation and the action before it, the newest last; rows from before the start are zero.
-    """
+    """Actor and critic with extrinsics estimated from H observations and actions; hidden: memory, then history."""
 
     shape: AdaptiveShape
 

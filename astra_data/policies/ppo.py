@@ -1,8 +1,4 @@
-"""Proximal policy optimization (Schulman et al. 2017) on a batched environment.
-
-One iteration collects a rollout from every environment and makes a few passes over it. Minibatches are short
-segments of the rollouts, so the same code trains policies with and without memory.
-"""
+"""Proximal policy optimization (Schulman et al. 2017) on a batched environment."""
 
 import math
 
@@ -138,10 +134,7 @@ class Ppo(Learner):
                 self._optimizer.step()
 
     def _loss(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """Return the loss, eq. 9 of Schulman et al. with the clipped objective of eq. 7, and an estimated KL.
-
-        The divergence is that of the policy from the one that collected the rollout.
-        """
+        """Return the loss (eq. 9 with eq. 7's objective), and an estimate of the KL from the policy that collected."""
         policy = self.policy
         remembered = policy.remember_sequence(*(batch[name] for name in _SEEN))
         features, action, action_log_prob, advantage, target = (
@@ -169,11 +162,7 @@ def generalized_advantages(
     discount: float,
     gae_lambda: float,
 ) -> Tensor:
-    """Return the generalized advantage estimates (B, T) of Schulman et al. 2016, eq. 16.
-
-    `value` is of the observation before each step, (B, T), `following` of the one after it; episodes that are
-    `done` end with the step, and where they are `terminated` nothing follows.
-    """
+    """Return generalized advantages (B, T) (Schulman et al. 2016, eq. 16); `following` are values after the steps."""
     error = reward + discount * following * ~terminated - value
     kept = discount * gae_lambda * (~done).to(value.dtype)
     advantage, later = torch.empty_like(error), torch.zeros_like(error[:, 0])

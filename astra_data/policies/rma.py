@@ -1,8 +1,4 @@
-"""Rapid motor adaptation, phase 2: a student learns to estimate its teacher's extrinsics while it acts.
-
-After Kumar et al. 2021. The student acts itself, so that it learns from the histories that its own mistakes
-lead to.
-"""
+"""Rapid motor adaptation, phase 2: a student that acts learns its teacher's extrinsics (Kumar et al. 2021)."""
 
 import math
 from typing import Annotated
@@ -34,10 +30,7 @@ class RmaConfig(Config):
 
 
 class Adaptation(Learner):
-    """A phase 2 in progress: one update per step, on the current histories of all rows.
-
-    Only the `student`'s estimate of the extrinsics is trained.
-    """
+    """A phase 2 in progress: each step updates the `student`'s estimate of the extrinsics, and nothing else."""
 
     def __init__(
         self, env: BatchedEnv, teacher: Teacher, config: RmaConfig, *, rollout_steps: int, horizon: int, seed: int
@@ -59,11 +52,7 @@ class Adaptation(Learner):
         )
 
     def _iterate(self) -> dict[str, float]:
-        """Take `rollout_steps` batched steps, learning after each.
-
-        Returns "r2_extrinsics", the share of the extrinsics' variance that the estimates explain, with those
-        at the start of episodes, without a history; NaN where nothing varies.
-        """
+        """Take `rollout_steps` batched steps, learning after each; return the estimates' R² as "r2_extrinsics"."""
         for group in self._optimizer.param_groups:
             group["lr"] = self.config.adaptation_learning_rate * self.share_left
         errors, true = [], []

@@ -103,10 +103,7 @@ Observed = Literal["abstract", "full"]
 
 
 def target_observation(task: Task, state: Tensor, goal: Tensor, latent: Tensor | None, observed: Observed) -> Tensor:
-    """Assemble a policy's observation (..., O) of target states (..., S), goals (..., G) and latents, if any.
-
-    It is the observation of φ(s), followed, where the full state is observed, by the rest of the state.
-    """
+    """Assemble a policy's observation (..., O) of target states: that of φ(s), then, if "full", the rest."""
     abstract = policy_observation(task.objective, task.abstraction(state), goal, latent)
     return abstract if observed == "abstract" else torch.cat([abstract, task.beyond(state)], dim=-1)
 

@@ -1,8 +1,7 @@
-"""Soft actor-critic on a batched environment (Haarnoja et al. 2018, arXiv 1812.05905).
+"""Soft actor-critic (Haarnoja et al. 2018, arXiv 1812.05905) on a batched environment.
 
-Where the policy has a memory, the critics share another one, and all learn from windows of recent steps, whose
-first steps only fill the memories. At the start of a window the policy's memory is the one stored while acting
-(Kapturowski et al. 2019); that of the critics, which see only windows, is empty.
+Policies with a memory learn from windows that begin with the memory stored while acting (Kapturowski et al. 2019); the
+critics share another memory, which is empty there.
 """
 
 import copy
@@ -219,10 +218,7 @@ class Replay:
             self._columns["expired"][last] |= ~self._columns["terminated"][last]
 
     def windows(self, count: int, length: int, burn_in: int) -> tuple[dict[str, Tensor], Tensor]:
-        """Draw windows (count, length + 1, ...) of consecutive steps, and which to learn from, (count, length) bool.
-
-        Not those at the horizon, whose next observation is not kept, nor a `burn_in`, which only warms up the memory.
-        """
+        """Draw windows (count, length + 1, ...), and which to learn from, (count, length): no `burn_in`, no horizon."""
         device = self._columns["reward"].device
         oldest = self._added - len(self)
         begin = oldest + torch.randint(len(self) - length, (count, 1), device=device)

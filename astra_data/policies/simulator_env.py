@@ -19,6 +19,8 @@ from astra_data.worlds.task import Task
 from astra_data.worlds.variation import Variation
 
 RewardSource = Literal["abstract", "predicted", "priced"]
+"""The task's own reward on abstract states; the target's, as R_pred predicts it (Algorithm 2), but where states decide;
+the task's own minus the predicted cost of failures, times `RISK_WEIGHT`."""
 
 RISK_WEIGHT = 4.0
 """How many failures a predicted one counts as in the reward "priced": a failure also costs the rest of the
@@ -61,12 +63,7 @@ def policy_observation(objective: Objective, state: Tensor, goal: Tensor, latent
 
 
 class SimulatorEnv:
-    """A batched environment over an abstract simulator.
-
-    Rewards: "abstract", the task's own on abstract states; "predicted", the target's as R_pred predicts it
-    (Algorithm 2); "priced", the task's own minus the predicted cost of failures, times `RISK_WEIGHT`. Where the
-    abstract state itself decides the step, "predicted" pays the task's own reward as well.
-    """
+    """A batched environment over an abstract simulator; see `RewardSource`."""
 
     def __init__(
         self,

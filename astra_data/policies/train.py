@@ -1,8 +1,4 @@
-"""Train a policy: the inputs of a method's training, and the training of most methods.
-
-Most train by PPO, or by SAC, in the abstract simulator: raw, varied, or corrected by the method's grounding
-(Algorithm 2).
-"""
+"""Train a policy as most methods do: by PPO or SAC in the abstract simulator, raw, varied or corrected."""
 
 import math
 import shutil
@@ -180,10 +176,7 @@ class InSimulator:
 def train_in(
     env: ResumableEnv, config: PpoTrainConfig | SacTrainConfig, memory_size: int, training: Training, horizon: int
 ) -> tuple[Policy, dict[str, Any]]:
-    """Train a new policy in `env`, of episodes of at most `horizon` steps; return it and its learning curve.
-
-    The policy has a memory of `memory_size`.
-    """
+    """Train a new policy in `env`, of episodes of at most `horizon` steps; return it and its learning curve."""
     torch.manual_seed(derive(training.seed, "policy"))
     shape = PolicyShape(env.observation_size, env.action_size, memory_size, hidden_sizes=config.hidden_sizes)
     device, options = training.device, {"horizon": horizon, "seed": training.seed}
@@ -198,13 +191,7 @@ def train_in(
 def optimize(
     learner: Learner, env: ResumableEnv, training: Training, checkpoint_name: str = CHECKPOINT
 ) -> dict[str, Any]:
-    """Train to the end, from the checkpoint in the folder if there is one; return the learning curve.
-
-    Once training episodes succeed at penalties of full size, the rest of the training, whose schedules go on,
-    takes fewer steps. With SAC, which learns from rewards of long ago as well, penalties have full size from
-    the start, and so in tasks whose success is to last. The last checkpoint is left in the folder, for what
-    comes after.
-    """
+    """Train to the end, or on from the checkpoint; return the curve. A mastered simulator quickens what is left."""
 
     def go_on(state: dict[str, Any]) -> None:
         world = {name: values.to(training.device) for name, values in state["world"].items()}
@@ -274,14 +261,7 @@ class InTarget:
 
 
 def with_restarts(learn: Learn, training: Training, grounding_file: Path | None) -> tuple[PolicyFile, dict[str, Any]]:
-    """Train until a policy masters its own simulator, `tries` times at most, each from another seed.
-
-    The grounding is read again from `grounding_file` where that is not on the CPU: policies are tested there.
-
-    Returns:
-        the policy that does, or else the one with the most success there; and its learning curve, with the
-        time that all tries took, and with them as "tries": their seeds, what they reached, and their points.
-    """
+    """Train until a policy masters its own simulator, `tries` times at most, and return the best with its curve."""
     config, made = training.config, list[tuple[Reached, PolicyFile, dict[str, Any]]]()
     if config.tries == 1:
         return learn(training)

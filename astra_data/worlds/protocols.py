@@ -1,8 +1,4 @@
-"""Interfaces of abstract simulators, a user's `Simulator` among them, and of batched environments.
-
-`step.observation` is always the state that the action led to, also in the last step of an episode, so that learners
-can bootstrap from it. No row restarts by itself.
-"""
+"""Interfaces of abstract simulators, a user's `Simulator` among them, and of batched environments."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -109,7 +105,7 @@ class RememberingSimulator(Protocol):
 class Step:
     """The outcome of one batched step."""
 
-    observation: Tensor  # (B, O) float32, after the action
+    observation: Tensor  # (B, O) float32, after the action, also of the last step of an episode: no row restarts itself
     reward: Tensor  # (B,) float32
     terminated: Tensor  # (B,) bool, the episode ended: the value of the next state is 0
     success: Tensor  # (B,) bool, the goal was reached in this step

@@ -52,10 +52,7 @@ class NumpySimulator(FreeStates):
         size: int,
         parameters: Mapping[str, float] | None = None,
     ) -> None:
-        """Begin with B states of zeros, each of `size`; `parameters` are numbers or texts that datasets record.
-
-        `function` maps states (B, X) and commands (B, A), both float64, to the next states (B, X).
-        """
+        """Begin with B states of zeros; `function` maps states (B, X) and commands (B, A), float64, to the next."""
         super().__init__(torch.zeros(num_envs, size))
         self._function = function
         self.parameters: dict[str, float] = dict(parameters or {})

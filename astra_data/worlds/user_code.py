@@ -151,10 +151,7 @@ def _place(error: BaseException) -> str:
 
 
 def code_digest(name: str) -> str | None:
-    """Return a digest of the code that `name` begins with; None where it is this package's, or not found.
-
-    Of a file, the files beside it that it imports count, of a module all of its package; and models and data they name.
-    """
+    """Return a digest of the code at `name`, what it imports beside it and data it names; None if it is not found."""
     place = name.rpartition(":")[0]
     file = Path(place)
     files, folder = ([file], file.parent) if file.suffix == ".py" else _installed(place)

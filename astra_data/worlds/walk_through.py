@@ -21,10 +21,7 @@ _log = logging.getLogger(__name__)
 
 
 def check_task(task: Task, device: str = "cpu") -> list[str]:
-    """Return one line for each piece of a task that is not as it should be; none if all is well.
-
-    States are drawn, set, stepped and judged; a robot is reset, but not moved. `device`: where policies are trained.
-    """
+    """Return one line for each faulty piece of a task; `device` is where policies are trained."""
     faults: list[str] = []
 
     def tried[T](check: Callable[..., T], *given: object) -> T | None:

@@ -72,10 +72,7 @@ def up_cosine(quaternion: Floats) -> Floats:
 
 
 def canonical_view(qpos: Floats, qvel: Floats, command: Floats) -> tuple[Floats, NDArray[np.intp]]:
-    """Describe body and command (B, 2) in the heading frame, turned by quarters (legs are copies) toward the command.
-
-    Return the observation (B, 28), and how many quarter turns (B,) lie between the body's numbering of legs and its.
-    """
+    """Return body and command (B, 2) in the heading frame (B, 28), turned by quarters (B,) toward the command."""
     rotation = rotation_matrix(qpos[:, 3:7])
     yaw = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
     bearing = np.arctan2(command[:, 1], command[:, 0]) - yaw

@@ -164,11 +164,7 @@ class Phi:
 
 @Phi
 def humanoid_to_walker2d(state: Tensor) -> Tensor:
-    """Keep the state of a planar walker: (..., 47) to (..., 15).
-
-    Height and pitch (of the forward axis, below the horizon), the commanded joints' angles; horizontal velocity along
-    the heading, then the rates of all of these; whether the feet touch the floor, 1 or 0.
-    """
+    """Keep a planar walker: height, pitch, hips and knees, their rates, contacts of feet: (..., 47) to (..., 15)."""
     height, spin = state[..., _HEIGHT], state[..., _SPIN]
     joints, turn = state[..., _JOINTS], rotation(state[..., _QUATERNION])
     velocity = _headed(turn, state[..., _VELOCITY])
@@ -193,11 +189,7 @@ def humanoid_to_kinematics(state: Tensor) -> Tensor:
 
 @Phi
 def humanoid_to_extended_kinematics(state: Tensor) -> Tensor:
-    """Keep all joints, the motion of the center of mass and the lean of the torso: (..., 47) to (..., 46).
-
-    Along the heading: center of mass from the midpoint of the feet, its height, its velocity; in the torso's frame: the
-    direction of up and the angular velocity, the paper's robot-level information (of Radosavovic et al. 2024).
-    """
+    """Keep joints, center of mass along the heading, its velocity, the torso's up and spin: (..., 47) to (..., 46)."""
     joints, rates = state[..., _JOINTS], state[..., _RATES]
     turn = rotation(state[..., _QUATERNION])
 

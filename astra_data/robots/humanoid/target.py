@@ -46,10 +46,7 @@ Actuators = Literal["positions", "motors"]
 
 
 def humanoid_model(actuators: Actuators = "positions") -> mujoco.MjModel:
-    """Load Gymnasium's humanoid: with "motors" unchanged, with "positions" controlled by joint angles in rad.
-
-    MuJoCo then holds them in every physics step, up to the motors' torques; once per control step they would chatter.
-    """
+    """Load Gymnasium's humanoid; with "positions" MuJoCo holds joint angles in rad, up to the motors' torques."""
     path = Path(str(files("gymnasium.envs.mujoco") / "assets" / "humanoid.xml"))
     model = mujoco.MjModel.from_xml_path(str(path))
     if actuators == "positions":
@@ -144,11 +141,7 @@ class Locomotion:
 
 
 class HumanoidEnv(PhysicsTarget):
-    """B humanoids; action: angles of left hip, left knee, right hip, right knee, (B, 4), clipped to ±1.
-
-    State (B, 47): qpos, qvel. Observation (B, 45): the state without x and y. Only falling ends an episode. Position
-    actuators cost by their torques over the motors' gears: otherwise targets would cost, not effort.
-    """
+    """B humanoids, states (B, 47); action: angles of hips and knees, (B, 4), clipped to ±1; falls end episodes."""
 
     observation_size = STATE_SIZE - 2
     action_size = len(COMMANDED)

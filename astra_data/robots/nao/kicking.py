@@ -85,10 +85,8 @@ _FADES = 0.75  # share of the evidence of a hit that counts in the next step: a 
 class BallAgent(PlanarStates):
     """B point masses, each with a ball: [x, y, vx, vy, ball x, ball y, ball vx, ball vy], in m and m/s.
 
-    A command is the velocity of the next step, ±1 of the top speed per axis, and whether to stand and kick. Corrections
-    move only balls that rolled or were touched, and say how fast, not where to. Whether one that lay starts to roll is
-    drawn, once for as long as it lies, so that the expected speed is the corrected one: it would else creep, or
-    policies that kick from too far would wait until it works.
+    A command is the velocity of the next step and whether to stand and kick. Corrections move only balls that rolled or
+    were touched. Whether one that lay starts to roll is drawn once: none creeps, and no policy waits until a kick works.
     """
 
     state_size = 8

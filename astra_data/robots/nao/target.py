@@ -49,11 +49,9 @@ BALL_SIZE = 5  # with a ball there follow its estimated position (2) and velocit
 
 
 class NaoEnv(PlanarTarget):
-    """B NAOs; action: world-frame velocity command, (B, 2), in units of 0.25 m/s and clipped to ±1 per axis.
+    """B NAOs that act on estimates, their states; rewards are of true positions, steps last 0.192 s.
 
-    With a ball, (B, 3), a third entry above 0.5 asks for a kick. A control step lasts 0.192 s. Robots turn by
-    themselves to where they go, or to their ball. They act on estimates, which their state (B, S) holds; rewards are of
-    true positions.
+    Action: world-frame velocity command, ±1 per axis; above 0.5 a third entry asks for a kick. They turn by themselves.
     """
 
     def __init__(

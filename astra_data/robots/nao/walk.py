@@ -1,8 +1,7 @@
 """The NAO's legs: their angles in closed form, how robots differ, how they walk; links and joints are in nao.xml.
 
-A foot's pose is that of its sole below the ankle, in the torso's frame: x, y, z in m, roll, pitch, yaw in rad
-(Rz(yaw) Ry(pitch) Rx(roll)). One motor turns both hips about axes tilted by 45°: it takes the mean of the angles that
-each foot alone would need; the other joints then keep the soles' positions and planes exact.
+Poses of feet are those of soles in the torso's frame: x, y, z in m, roll, pitch, yaw in rad. One motor turns both hips:
+it takes the mean of what each foot needs; the other joints keep the soles' positions and planes exact.
 """
 
 from dataclasses import dataclass, field, fields, replace
@@ -231,10 +230,7 @@ class StepPlanner:
         return np.stack([x, y, turn], axis=1)
 
     def advance(self, gait: Gait, command: Floats, seconds: float, on_the_spot: Bools | None = None) -> Bools:
-        """Advance `gait` in place; where a step ends, plan the next by `command` (B, 3); return which began one, (B,).
-
-        With a command of zero robots come to rest, except those that walk `on_the_spot` (B,).
-        """
+        """Advance `gait` in place, planning steps by `command` (B, 3), zero for rest; return which began one, (B,)."""
         gait.phase = np.where(gait.walking, gait.phase + seconds / gait.duration_s, 0.0)
         called = (command != 0).any(axis=1)
         if on_the_spot is not None:

@@ -1,8 +1,4 @@
-"""Mazes: walls, free space, distances along the corridors; shared by targets and abstract simulators.
-
-Cells are (row, column) from the top left; x grows with the column, y falls with the row, the origin is the middle.
-Fine grids have square cells of the maze's `fine_m` and are indexed [y, x] from the lower left corner.
-"""
+"""Mazes of square cells (row, column) from the top left; fine grids are indexed [y, x] from the lower left."""
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -99,8 +95,7 @@ class Maze:
     def distance_field(self, goal: Floats, *, radius: float = 0.0, margin: float = 0.0) -> Floats:
         """Return the length in m of the shortest free path from each fine cell to `goal` (2,), [y, x].
 
-        Cells within `radius` m of a wall are not free; within `margin` m they cost more. Cells that are not free, or
-        closed off, take the value of the nearest one with a path plus the distance to it.
+        Cells within `margin` m of walls cost more; those within `radius` m, or closed off, take the value of a free one.
         """
         free = self.clearance_field > radius
         goal_cell = self.fine_index(goal)
@@ -167,10 +162,7 @@ class FreeSpace:
         return cls(torch.from_numpy(blocked).to(device), half_extent, maze.fine_m)
 
     def slide(self, start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
-        """Move points from `start` to `end` (B, 2), each axis up to blocked cells; return where, and who was stopped.
-
-        Only the cells where a move begins and ends are looked at. From a blocked cell a point may not go deeper.
-        """
+        """Move points from `start` to `end` (B, 2), each axis up to blocked cells; return where, and who stopped."""
         here, there = self.cells(torch.stack([start, end]))
         (from_x, from_y), (to_x, to_y) = here.unbind(-1), there.unbind(-1)
         onward = there > here

@@ -72,10 +72,7 @@ class PlanarStates:
         self._settles_in = FreeSpace.of_maze(self._maze, radius_m=widest, device=str(self.state.device))
 
     def settle(self, before: Tensor, landed: Tensor) -> Tensor:
-        """Slide the discs from `before` toward `landed`, both (B, X); all else is that of `landed`.
-
-        Walls that stopped the step count, and who is kept clear of one stands there: policies would else lean on it.
-        """
+        """Slide discs from `before` toward `landed` (B, X); who is kept clear of a wall stands there."""
         position, stopped = (self._settles_in or self.free).slide(before[:, :2], landed[:, :2])
         self.blocked = self.blocked | stopped
         velocity = landed[:, 2:4]

@@ -86,10 +86,7 @@ class Relocation:
                 yield PlanarMap(turn.rotation_rad, (float(x), float(y))), steps
 
     def copied(self, episode: Episode, moving: Sequence[Column], rng: np.random.Generator) -> Copy | None:
-        """Move a part of `episode`, with a goal of its own, judged by the task; None where there is no room.
-
-        The step that ended an episode with a ball is left out, and the copy does not begin with it in the goal or out.
-        """
+        """Move a part of `episode`, with a goal of its own, judged by the task; None where there is no room."""
         world, movable, has_ball = self.task, episode, self.task.ball_index is not None
         if has_ball and episode.columns[TERMINATED][-1]:
             movable = replace(episode, columns={name: each[:-1] for name, each in episode.columns.items()})
