@@ -44,7 +44,8 @@ def values(case: str, episode: int) -> dict[str, Any]:
         "next.reward": rng.normal(size=steps).astype(np.float32),
         "next.done": last,
         "next.success": last & (episode != 2),
-        "observation.images.top": np.zeros((steps, 8, 8, 3), np.uint8),
+        "observation.images.top": np.full((1, 8, 8, 3), 9, np.uint8)
+        * np.arange(steps, dtype=np.uint8)[:, None, None, None],
     }
 
 

@@ -77,6 +77,8 @@ PANELS: dict[str, dict[str, Callable[..., None]]] = {
         "augment walks --copies 3 --rotations quarter": building.augment,
         "merge walks more --name all": datasets.merge,
         "filter walks --success": datasets.filter_,
+        "trim logs --start 2 --without 'v < 0.05'": datasets.trim,
+        "resample logs --fps 20": datasets.resample,
         "list": datasets.list_,
         "inspect walks --plot figures": datasets.inspect,
         "validate walks@data-1.0.0": datasets.validate,

@@ -103,6 +103,41 @@ def filter_(
         _report(filter_episodes(open_dataset(dataset), **conditions, name=name, out=out))
 
 
+def trim(
+    dataset: DatasetName,
+    start: Annotated[float, typer.Option(min=0.0, metavar="SECONDS", help="Time to remove from the start.")] = 0.0,
+    end: Annotated[float, typer.Option(min=0.0, metavar="SECONDS", help="Time to remove from the end.")] = 0.0,
+    still: Annotated[
+        bool, typer.Option("--still", help="Remove the steps at either end in which the state does not change.")
+    ] = False,
+    without: Annotated[
+        str | None,
+        typer.Option(metavar="CONDITION", help="Remove the steps in which it holds, such as 'v < 0.05'."),
+    ] = None,
+    name: NewName = None,
+    out: Out = None,
+) -> None:
+    """Write a dataset with shorter episodes, or without some of their steps."""
+    from astra_data.dataset.timing import trim as write
+    from astra_data.dataset.versions import open_dataset
+
+    source = open_dataset(dataset)
+    _report(write(source, start_s=start, end_s=end, still=still, without=without, name=name, out=out))
+
+
+def resample(
+    dataset: DatasetName,
+    fps: Annotated[int, typer.Option(min=1, help="Steps per second of the new dataset.")],
+    name: NewName = None,
+    out: Out = None,
+) -> None:
+    """Write a dataset at another rate: commands held, states interpolated, times true."""
+    from astra_data.dataset.timing import resample as write
+    from astra_data.dataset.versions import open_dataset
+
+    _report(write(open_dataset(dataset), fps, name=name, out=out))
+
+
 def _report(folder: Path) -> None:
     from astra_data.dataset.reader import Dataset
     from astra_data.dataset.versions import home_of, versions_at_home

@@ -64,6 +64,8 @@ def _summary(inspection: Inspection) -> str:
         f"{inspection.reference}: {len(lengths)} episodes, {lengths.sum():,} steps, {minutes:.1f} min",
         f"lengths {lengths.min()} to {lengths.max()}, median {np.median(lengths):g}  {sparkline(histogram)}",
     ]
+    for name, shape in inspection.cameras.items():
+        lines.append(f"camera {printable(name)}: {'x'.join(map(str, shape))}")
     if inspection.success is not None:
         share = inspection.success / len(lengths)
         lines.append(f"success {inspection.success} of {len(lengths)} episodes ({share:.2f})")

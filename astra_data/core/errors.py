@@ -56,7 +56,7 @@ EXTRAS = {
     **dict.fromkeys(("torch", "mujoco", "gymnasium", "gymnasium_robotics", "safetensors", "scipy"), "sim"),
     **dict.fromkeys(("matplotlib", "PIL", "pandas"), "report"),
     **dict.fromkeys(("onnxruntime", "onnxscript"), "deploy"),
-    **dict.fromkeys(("lerobot", "datasets"), "lerobot"),
+    **dict.fromkeys(("lerobot", "datasets", "av"), "lerobot"),
     **dict.fromkeys(("mcap", "mcap_protobuf", "mcap_ros2"), "mcap"),
     **{"h5py": "hdf5", "minari": "minari", "ray": "ray", "trackio": "trackio", "rerun": "view"},
 }

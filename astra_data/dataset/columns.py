@@ -8,7 +8,8 @@ A column with one value per step has shape (T,), all others (T, size): never (T,
 
 import hashlib
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -165,6 +166,25 @@ OUTCOME_COLUMNS = (
 )  # the outcome of a step, in every collected dataset
 
 
+@dataclass(frozen=True)
+class Clip:
+    """`count` pictures of a file, one each `step` from `start` on: seconds of a video, rows of a parquet file."""
+
+    path: Path
+    camera: str
+    start: float
+    step: float
+    count: int
+    digest: str | None = None  # sha256 of the video, where it is known
+    statistics: Mapping[str, Any] = field(default_factory=dict, compare=False)
+    """LeRobot's, of the episode that the pictures were recorded in."""
+
+    def part(self, first: int, end: int, every: int = 1) -> "Clip":
+        """Return the pictures `first` to `end`, exclusive, each `every`-th."""
+        count = -(-(end - first) // every)
+        return replace(self, start=self.start + first * self.step, step=self.step * every, count=count)
+
+
 @dataclass(frozen=True, repr=False, eq=False)
 class Episode:
     """One episode of T steps.
@@ -174,6 +194,7 @@ class Episode:
         columns: name to (T,) or (T, size) contiguous array of one of `DTYPES`, never one of the `RESERVED`
             names; values given as (T, 1), as Gymnasium has them, become (T,).
         metadata: facts about the whole episode (success, return, seed, source_episode, ...).
+        cameras: the pictures of each camera, a clip of T.
 
     Raises:
         BadInputError: lists every fault, with column and first frame.
@@ -189,6 +210,7 @@ class Episode:
     uid: int
     columns: Mapping[str, Array]
     metadata: Mapping[str, Scalar] = field(default_factory=dict)
+    cameras: Mapping[str, Clip] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Convert numpy scalars and array layouts, and validate the episode."""
@@ -214,6 +236,11 @@ class Episode:
                 faults.append(f"metadata {key}: {value}, expected a finite number")
         if faults:
             raise BadInputError(f"Episode {self.uid}: {'; '.join(faults)}.")
+
+    def part(self, first: int, end: int) -> tuple[dict[str, Array], dict[str, Clip]]:
+        """Return the columns and cameras of the steps `first` to `end`, exclusive."""
+        columns = {name: values[first:end].copy() for name, values in self.columns.items()}
+        return columns, {name: clip.part(first, end) for name, clip in self.cameras.items()}
 
     def __len__(self) -> int:
         """Return T."""

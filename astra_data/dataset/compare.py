@@ -68,6 +68,8 @@ def schema_differences(a: Dataset, b: Dataset) -> list[str]:
     found += [f"column {name}: only in {b.reference}" for name in theirs if name not in ours]
     for name in (name for name in ours if name in theirs):
         found += _value_differences(ours[name], theirs[name], f"column {name}: ")
+    seen, other = ({name: [it.feature["dtype"], it.feature["shape"]] for name, it in d.cameras.items()} for d in (a, b))
+    found += _value_differences(seen, other, "camera ")
     return [*found, *_value_differences({"fps": a.info["fps"]}, {"fps": b.info["fps"]})]
 
 

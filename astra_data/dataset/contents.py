@@ -1,8 +1,8 @@
 """The contents of a dataset: everything but the values of its columns."""
 
 import json
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import zip_longest
 from pathlib import Path
@@ -14,6 +14,7 @@ import pyarrow as pa
 from astra_data.core.arrays import Ints
 from astra_data.core.errors import BadInputError, CorruptDatasetError, in_short
 from astra_data.dataset import format as layout
+from astra_data.dataset.cameras import Camera, read_cameras
 from astra_data.dataset.columns import Array, Column, Scalar
 from astra_data.dataset.description import altered_files, read_description
 from astra_data.dataset.lerobot_rows import RecordedFiles
@@ -47,6 +48,7 @@ class Contents:
     task: str
     paths: list[Path]  # the data files in order
     file_starts: Ints  # first row of each file
+    cameras: Mapping[str, Camera] = field(default_factory=dict)
     recorded: RecordedFiles | None = None  # where LeRobot recorded it, how its rows are converted
 
     @cached_property
@@ -74,6 +76,8 @@ def _parsed(root: Path, description: dict[str, Any]) -> Contents:
     )
     if not is_data_path(info["data_path"]):
         raise BadInputError(f"expected a path inside the dataset's folder, got {info['data_path']!r}")
+    cameras, faults_of = read_cameras(root, info, description.get("videos", {}))
+    info["features"] = {name: it for name, it in info["features"].items() if name not in {*cameras, *faults_of}}
     columns = [Column.from_feature(name, feature) for name, feature in info["features"].items()]
     tables = pa.concat_tables(read_blocks(episodes_files(root), _LOCATION))
     lengths, chunks, files = (to_numpy(tables.column(name), 1, "int64") for name in _LOCATION)
@@ -84,7 +88,8 @@ def _parsed(root: Path, description: dict[str, Any]) -> Contents:
     for chunk, file, length in zip(chunks.tolist(), files.tolist(), lengths.tolist(), strict=True):
         path = root / info["data_path"].format(chunk_index=chunk, file_index=file)
         rows[path] = rows.get(path, 0) + length
-    faults = [f"{path.relative_to(root)} does not belong to it" for path in sorted({*data_files(root)} - {*rows})]
+    faults = [f"{name}: {fault}" for name, fault in faults_of.items()]
+    faults += [f"{path.relative_to(root)} does not belong to it" for path in sorted({*data_files(root)} - {*rows})]
     for path, expected in rows.items():
         name, footer = path.relative_to(root), read_footer(path)
         if isinstance(footer, str):
@@ -111,6 +116,7 @@ def _parsed(root: Path, description: dict[str, Any]) -> Contents:
         task=tasks[0],
         paths=list(rows),
         file_starts=np.cumsum([0, *rows.values()])[:-1],
+        cameras=cameras,
     )
 
 

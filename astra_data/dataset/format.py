@@ -26,6 +26,9 @@ INFO_PATH = "meta/info.json"
 STATS_PATH = "meta/stats.json"
 TASKS_PATH = "meta/tasks.parquet"
 EPISODES_PATH = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
+VIDEO_PLACE = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
+IMAGE = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 
 OUR_FOLDER = "meta/astra"
@@ -79,15 +82,17 @@ def arrow_type(dtype: str, size: int) -> pa.DataType:
     return value if size == 1 else pa.list_(value, size)
 
 
-def data_schema(columns: Sequence[Column]) -> pa.Schema:
+def data_schema(columns: Sequence[Column], images: Sequence[str] = ()) -> pa.Schema:
     """Return the Arrow schema of the data files, with the metadata that HF datasets reads."""
     features: dict[str, Any] = {}
     for column in columns:
         value = {"dtype": column.dtype, "_type": "Value"}
         listed = {"feature": value, "length": column.size, "_type": "List"}
         features[column.name] = value if column.size == 1 else listed
+    features |= {name: {"_type": "Image"} for name in images}
     metadata = {"huggingface": json.dumps({"info": {"features": features}})}
-    return pa.schema([(column.name, arrow_type(column.dtype, column.size)) for column in columns], metadata=metadata)
+    fields = [(column.name, arrow_type(column.dtype, column.size)) for column in columns]
+    return pa.schema([*fields, *((name, IMAGE) for name in images)], metadata=metadata)
 
 
 def data_encodings(columns: Sequence[Column]) -> dict[str, str]:
@@ -99,8 +104,8 @@ def data_encodings(columns: Sequence[Column]) -> dict[str, str]:
     }
 
 
-def episodes_schema(columns: Sequence[Column]) -> pa.Schema:
-    """Return the Arrow schema of meta/episodes."""
+def episodes_schema(columns: Sequence[Column], cameras: Mapping[str, Mapping[str, Any]]) -> pa.Schema:
+    """Return the Arrow schema of meta/episodes; `cameras` are the features of cameras."""
     fields: list[tuple[str, pa.DataType]] = [
         ("episode_index", pa.int64()),
         ("tasks", pa.list_(pa.string())),
@@ -114,6 +119,14 @@ def episodes_schema(columns: Sequence[Column]) -> pa.Schema:
         for name in STORED_STATISTICS:
             value = pa.int64() if name == "count" else pa.float64()
             fields.append((f"stats/{column.name}/{name}", pa.list_(value)))
+    for name, feature in cameras.items():
+        if feature["dtype"] == "video":
+            fields += [(f"videos/{name}/{key}", pa.int64()) for key in VIDEO_PLACE[:2]]
+            fields += [(f"videos/{name}/{key}", pa.float64()) for key in VIDEO_PLACE[2:]]
+        nested = pa.list_(pa.list_(pa.list_(pa.float64())))
+        fields += [
+            (f"stats/{name}/{key}", pa.list_(pa.int64()) if key == "count" else nested) for key in STORED_STATISTICS
+        ]
     fields += [("meta/episodes/chunk_index", pa.int64()), ("meta/episodes/file_index", pa.int64())]
     return pa.schema(fields)
 
@@ -136,12 +149,14 @@ def tasks_table(task: str) -> pa.Table:
     return pa.table({"task_index": [0], "task": [task]}, schema=schema)
 
 
-def dataset_info(columns: Sequence[Column], *, fps: int, episodes: int, frames: int) -> Mapping[str, Any]:
-    """Return meta/info.json."""
+def dataset_info(
+    columns: Sequence[Column], cameras: Mapping[str, Mapping[str, Any]], *, fps: int, episodes: int, frames: int
+) -> dict[str, Any]:
+    """Return meta/info.json; `cameras` are the features of cameras."""
     return {
         "codebase_version": CODEBASE_VERSION,
         "fps": fps,
-        "features": {column.name: column.feature() for column in columns},
+        "features": {**{column.name: column.feature() for column in columns}, **cameras},
         "total_episodes": episodes,
         "total_frames": frames,
         "total_tasks": 1,
@@ -149,7 +164,7 @@ def dataset_info(columns: Sequence[Column], *, fps: int, episodes: int, frames: 
         "data_files_size_in_mb": DATA_FILE_SIZE_MB,
         "video_files_size_in_mb": VIDEO_FILE_SIZE_MB,
         "data_path": DATA_PATH,
-        "video_path": None,
+        "video_path": VIDEO_PATH if any(it["dtype"] == "video" for it in cameras.values()) else None,
         "robot_type": None,
         "splits": {"train": f"0:{episodes}"},
     }

@@ -152,8 +152,9 @@ class Frames:
         device: str = "cpu",
         memory_share: float = MEMORY_SHARE,
         cache: Path | None = None,
+        cameras: Sequence[str] = (),
     ) -> "Frames":
-        """Load whole columns `names`, by default all of `dataset.schema`.
+        """Load whole columns `names`, by default all of `dataset.schema`, and the decoded pictures of `cameras`.
 
         Columns of more than `memory_share` of the machine's memory are memory-mapped from raw files instead.
         Columns that do not fit on a CUDA device stay in main memory, and each batch is moved to the device.
@@ -165,6 +166,7 @@ class Frames:
             device: torch device of the batches.
             memory_share: 0 to memory-map always.
             cache: folder of the raw files, by default $ASTRA_DATA_CACHE, or else ~/.cache/astra-data.
+            cameras: names of cameras; their pictures, (N, H, W, 3) uint8, have to fit into main memory.
         """
         names = [column.name for column in dataset.schema] if names is None else names
         chosen = dataset.selected(episodes)
@@ -173,10 +175,12 @@ class Frames:
         if step_bytes * int(lengths.sum()) > memory_share * memory_bytes():
             home = os.environ.get("ASTRA_DATA_CACHE", Path.home() / ".cache" / "astra-data")
             arrays = mapped_columns(dataset, names, cache or Path(home))
-            starts = dataset.starts[chosen]
+            starts, shown = dataset.starts[chosen], dataset.selected(None)
         else:
             arrays = dataset.columns(names, episodes)
-            starts = np.cumsum(lengths) - lengths
+            starts, shown = np.cumsum(lengths) - lengths, chosen
+        for name in cameras:
+            arrays[name] = np.concatenate([dataset.pictures(name, int(number)) for number in shown])
         columns = {name: torch.from_numpy(values) for name, values in arrays.items()}
         target = torch.device(device)
         size = sum(values.nbytes for values in columns.values())

@@ -1,6 +1,6 @@
 """Summary of a dataset: episodes, histograms of values, a map of the robot's positions."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -71,6 +71,7 @@ class Inspection:
     reference: str
     fps: int
     lengths: Ints  # steps of each episode, (E,)
+    cameras: Mapping[str, Sequence[int]]  # to the shape of their pictures
     success: int | None  # number of successful episodes
     endings: Endings | None
     spreads: tuple[Spread, ...]  # one per column
@@ -95,6 +96,7 @@ def inspect_dataset(dataset: Dataset) -> Inspection:
         reference=dataset.reference,
         fps=int(dataset.info["fps"]),
         lengths=dataset.lengths,
+        cameras={name: camera.feature["shape"] for name, camera in dataset.cameras.items()},
         success=None if successes is None else sum(value is True for value in successes),
         endings=endings,
         spreads=tuple(spreads),

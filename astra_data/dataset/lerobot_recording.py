@@ -12,6 +12,7 @@ from astra_data.core.naming import first_few
 from astra_data.dataset import columns as names
 from astra_data.dataset import format as layout
 from astra_data.dataset import plain
+from astra_data.dataset.cameras import Camera, read_cameras
 from astra_data.dataset.columns import Column, Scalar
 from astra_data.dataset.contents import Contents
 from astra_data.dataset.description import ContentHash, Digests, complete_description, digest_of, permutation
@@ -67,8 +68,9 @@ def open_recording(root: Path) -> Contents:
     kept = [episode for episode in episodes if episode.steps]
     if not kept:
         raise BadInputError(f"{root}, recorded by LeRobot, has no episode of two rows or more")
-    others = sorted(info["features"].keys() - {*(spec.name for spec in specs), *names.RESERVED})
-    _announce(root, rows, columns, episodes, others, roundings.found())
+    cameras, unread = read_cameras(root, info, {})
+    others = sorted(info["features"].keys() - {*(spec.name for spec in specs), *names.RESERVED, *cameras, *unread})
+    _announce(root, rows, columns, episodes, others, roundings.found(), unread)
     uids, lengths = [episode.uid for episode in kept], np.array([episode.steps for episode in kept])
     positions = {uid: index for index, uid in enumerate(uids)}
     described = {"codebase_version": layout.CODEBASE_VERSION}
@@ -76,7 +78,7 @@ def open_recording(root: Path) -> Contents:
     all_columns, frames = layout.stored_columns(columns), int(lengths.sum())
     return Contents(
         root=root,
-        info=dict(layout.dataset_info(all_columns, fps=fps, episodes=len(kept), frames=frames)),
+        info=dict(layout.dataset_info(all_columns, {}, fps=fps, episodes=len(kept), frames=frames)),
         description=complete_description(description) | {"content_hash": content_hash},
         metadata={key: [episode.metadata[key] for episode in kept] for key in kept[0].metadata},
         uids=np.array(uids),
@@ -86,6 +88,12 @@ def open_recording(root: Path) -> Contents:
         task=" / ".join(tasks[index] for index in sorted(tasks)),
         paths=plain.data_files(root),
         file_starts=np.zeros(1, dtype=np.int64),
+        cameras={
+            name: Camera(
+                feature, [clip.part(0, it.steps) for clip, it in zip(clips, episodes, strict=True) if it.steps]
+            )
+            for name, (feature, clips) in cameras.items()
+        },
         recorded=RecordedFiles(
             rows=rows,
             first_rows=np.array([episode.first_row for episode in kept]),
@@ -191,6 +199,7 @@ def _announce(
     episodes: Sequence[Found],
     others: Sequence[str],
     rounded: Sequence[str],
+    unread: Mapping[str, str],
 ) -> None:
     """Say in one line what is left out or rounded, and which ends are not those of episodes."""
     parts = [*left_out(rows, episodes), *rounded]
@@ -204,6 +213,7 @@ def _announce(
         stored = rows.stored.get(column.name)
         if stored and not np.can_cast(stored.dtype, column.dtype):
             parts.append(f"{column.name} is {column.dtype} here, recorded as {stored.dtype}")
+    parts += [f"{camera} is left out: {fault}" for camera, fault in unread.items()]
     if others:
         parts.append(f"left out, because they are not lists of numbers: {', '.join(others)}")
     _log.warning("%s", f"{root}, recorded by LeRobot: {'; '.join(parts) or 'without our metadata'}")

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from astra_data.core.arrays import Ints
 from astra_data.core.errors import BadInputError, CorruptDatasetError, optional
 from astra_data.core.naming import RECORD, first_few
+from astra_data.dataset.cameras import clip_fault, decoded
 from astra_data.dataset.columns import RESERVED, SUCCESS, Array, Column, Episode
 from astra_data.dataset.contents import Contents, read_contents, read_values
 from astra_data.dataset.description import Digests, alteration, altered_columns, full_name, identity_of, read_digests
@@ -89,7 +90,7 @@ class Dataset(Contents):
 
     def __repr__(self) -> str:
         """Show name, version, size and columns."""
-        columns = ", ".join(f"{c.name} ({c.size}) {c.dtype}" for c in self.schema)
+        columns = ", ".join([*(f"{c.name} ({c.size}) {c.dtype}" for c in self.schema), *self.cameras])
         return f"Dataset({self.reference}, {len(self)} episodes, {self.lengths.sum()} steps, {columns})"
 
     def columns(self, names: Sequence[str], episodes: Collection[int] | None = None) -> dict[str, Array]:
@@ -137,7 +138,15 @@ class Dataset(Contents):
             for episode, columns in self._split(block, indices):
                 metadata = {key: values[episode] for key, values in self.metadata.items()}
                 known = {key: value for key, value in metadata.items() if value is not None}
-                yield Episode(int(self.uids[episode]), columns, known)
+                clips = {name: camera.clips[episode] for name, camera in self.cameras.items()}
+                yield Episode(int(self.uids[episode]), columns, known, clips)
+
+    def pictures(self, camera: str, episode: int) -> NDArray[Any]:
+        """Return the decoded pictures of an episode, by index: (T, H, W, 3) uint8, or (T, H, W) uint16 of depths."""
+        if camera not in self.cameras:
+            known = ", ".join(self.cameras) or "none"
+            raise BadInputError(f"{self.reference} has no camera {camera!r}; it has {known}")
+        return decoded(self.cameras[camera].clips[self.selected([episode])[0]])
 
     def successes(self) -> list[bool | None] | None:
         """Return whether each episode succeeded, by metadata or next.success; None where or if it is unknown."""
@@ -170,7 +179,9 @@ class Dataset(Contents):
         """Read every value again, LeRobot's own columns included; return what was altered, if anything."""
         try:
             blocks = read_values(self, self.specs(list(self.features)), self.selected(None))
-            return [fault for block, indices in blocks for fault in self.alterations(block, indices)]
+            faults = [fault for block, indices in blocks for fault in self.alterations(block, indices)]
+            clips = (clip for camera in self.cameras.values() for clip in camera.clips)
+            return faults + [fault for clip in clips if (fault := clip_fault(clip))]
         except CorruptDatasetError as error:
             return [str(error)]
 

@@ -91,8 +91,9 @@ def ranges(blocks: Iterable[Mapping[str, Array]]) -> dict[str, dict[str, Any]]:
 class EpisodeRows:
     """Writes meta/episodes, one row per `append`."""
 
-    def __init__(self, root: Path, columns: list[Column], task: str) -> None:
-        self._columns, self._task, self._schema = columns, task, episodes_schema(columns)
+    def __init__(self, root: Path, columns: list[Column], task: str, cameras: Mapping[str, Mapping[str, Any]]) -> None:
+        self._columns, self._task, self._schema = columns, task, episodes_schema(columns, cameras)
+        self.pictures: list[Mapping[str, Any]] = []  # places and statistics of the cameras, of each episode
         self._writer = RotatingWriter(root, EPISODES_PATH, self._schema)
         self._rows: list[tuple[int, int, int]] = []
         self._statistics: list[NDArray[np.float64]] = []
@@ -128,6 +129,9 @@ class EpisodeRows:
             for name in STORED_STATISTICS:
                 values = lengths[:, None] if name == "count" else stacked[:, STATISTICS.index(name), part]
                 arrays.append(to_lists(values))
+        for field in self._schema.names[len(arrays) : -2]:
+            known = (one.get(field) for one in self.pictures[self._episodes : self._episodes + count])
+            arrays.append(pa.array(known, self._schema.field(field).type))
         arrays += [pa.array(np.full(count, chunk)), pa.array(np.full(count, file))]
         self._writer.write(pa.Table.from_arrays(arrays, schema=self._schema))
         self._episodes += count

@@ -167,6 +167,9 @@ def next_version(
     change: Change,
     *,
     more: Sequence[Column] = (),
+    cameras: bool = True,
+    schema: Sequence[Column] | None = None,
+    fps: int | None = None,
     subset_seed: int | None = None,
     others: Iterable[Dataset] = (),
     task: str | None = None,
@@ -174,16 +177,18 @@ def next_version(
 ) -> DatasetWriter:
     """Prepare to write the version that follows `source`; its folder is the writer's `root`.
 
-    Columns, of which there may be `more`, fps, task, the seed of the subsets and the description are carried
-    over. `others` are further parents; `described` is what `successor` takes: `stage`, `config`, `name`, ...
+    Columns (or those of `schema`), of which there may be `more`, `cameras` unless False, `fps`, task, the seed of the
+    subsets and the description are carried over. `others` are further parents; `described` is what `successor`
+    takes: `stage`, `config`, `name`, ...
     """
     parents = [other.identity for other in others]
     description, folder = successor(source.description, change, parents=parents, **described)
     return DatasetWriter(
         folder,
-        [*source.schema, *more],
-        fps=source.info["fps"],
+        [*(source.schema if schema is None else schema), *more],
+        fps=fps or source.info["fps"],
         task=source.task if task is None else task,
         description=description,
         subset_seed=source.subset_seed if subset_seed is None else subset_seed,
+        cameras={name: camera.feature for name, camera in source.cameras.items()} if cameras else {},
     )

@@ -3,8 +3,9 @@
 import json
 import shutil
 from array import array
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -13,10 +14,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from astra_data.core.durable import atomic_folder
+from astra_data.core.durable import atomic_folder, file_digest
 from astra_data.core.errors import BadInputError, CorruptDatasetError, unmet
 from astra_data.dataset import columns as names
 from astra_data.dataset import format as layout
+from astra_data.dataset.cameras import ClipWriter, images, pooled
 from astra_data.dataset.columns import Column, Episode, Scalar
 from astra_data.dataset.description import (
     ContentHash,
@@ -72,6 +74,7 @@ class DatasetWriter:
         description: Mapping[str, Any],
         subset_seed: int = 0,
         compression: str = layout.COMPRESSIONS[0],
+        cameras: Mapping[str, Mapping[str, Any]] | None = None,
     ) -> None:
         """Prepare to write; entering the block starts.
 
@@ -83,6 +86,7 @@ class DatasetWriter:
             description: see `complete_description`.
             subset_seed: of the permutation whose prefixes are the nested subsets.
             compression: of the data files, one of `format.COMPRESSIONS`.
+            cameras: LeRobot's features of the cameras of every episode.
         """
         given = [column.name for column in columns]
         reserved = [name for name in given if name in names.RESERVED]
@@ -101,7 +105,9 @@ class DatasetWriter:
         self.root = root
         self._columns = {column.name: column for column in columns}
         self._stored = layout.stored_columns(columns)
-        self._schema = layout.data_schema(self._stored)
+        self._cameras = dict(cameras or {})
+        images_of = [name for name, feature in self._cameras.items() if feature["dtype"] == "image"]
+        self._schema = layout.data_schema(self._stored, images_of)
         self._fps, self._task, self._subset_seed, self._compression = fps, task, subset_seed, compression
         self._description = complete_description(description)
         self.made: dict[str, Any] = {}
@@ -111,7 +117,7 @@ class DatasetWriter:
         self._frames = 0
         self._lengths: dict[int, int] = {}
         self._metadata: list[Mapping[str, Scalar]] = []
-        self._admission = Admission(columns)
+        self._admission = Admission(columns, self._cameras)
         self._exit = ExitStack()
         self._is_open = False
 
@@ -127,7 +133,14 @@ class DatasetWriter:
             encodings = layout.data_encodings(self._stored)
             self._data = RotatingWriter(self._folder, layout.DATA_PATH, self._schema, encodings, self._compression)
             stack.callback(self._data.abandon)
-            self._rows = EpisodeRows(self._folder, self._stored, self._task)
+            self._rows = EpisodeRows(self._folder, self._stored, self._task, self._cameras)
+            self._clips = {
+                name: ClipWriter(partial(self._video, name), self._fps)
+                for name, feature in self._cameras.items()
+                if feature["dtype"] == "video"
+            }
+            for clips in self._clips.values():
+                stack.callback(clips.close)
             stack.callback(self._rows.abandon)
             self._exit = stack.pop_all()
         self._is_open = True
@@ -154,16 +167,29 @@ class DatasetWriter:
             raise BadInputError(f"{self.root}: add episodes inside `with DatasetWriter(...) as writer:`.")
         self._admission.admit(episode)
         length = len(episode)
+        pictures: dict[str, Any] = {}
+        for name, clip in episode.cameras.items() if self._cameras else ():
+            pictures |= {f"stats/{name}/{key}": value for key, value in clip.statistics.items()}
+            if name in self._clips:
+                span = self._clips[name].add(clip)
+                place = (*divmod(span.file, layout.CHUNK_SIZE), span.from_s, span.to_s)
+                pictures |= {f"videos/{name}/{key}": x for key, x in zip(layout.VIDEO_PLACE, place, strict=True)}
         values = {name: episode.columns[name] for name in self._columns} | layout.reserved_values(
             length, uid=episode.uid, episode=len(self._lengths), start=self._frames, fps=self._fps
         )
         values[names.TIMESTAMP] = values[names.TIMESTAMP].astype(np.float32)
         chunk, file = self._data.locate()
-        arrays = [to_arrow(values[field.name], field.type) for field in self._schema]
+        arrays = [
+            to_arrow(values[field.name], field.type)
+            if field.name in values
+            else pa.array(images(episode.cameras[field.name]), field.type)
+            for field in self._schema
+        ]
         self._data.write(pa.Table.from_arrays(arrays, schema=self._schema))
         for name, column in values.items():
             self._hash.update(name, column)
             self._digests[name].append(digest_of(column))
+        self._rows.pictures.append(pictures)
         self._rows.append(length, chunk, file, episode_statistics(values.values()))
         self._frames += length
         self._lengths[episode.uid] = length
@@ -173,13 +199,20 @@ class DatasetWriter:
         """Close the data files, write all other files and verify."""
         self._data.close()
         self._rows.close()
+        for clips in self._clips.values():
+            clips.close()
         if not self._lengths:
             raise BadInputError(f"{self.root}: no episodes were added; a dataset needs at least one.")
         episodes, uids = len(self._lengths), list(self._lengths)
-        info = layout.dataset_info(self._stored, fps=self._fps, episodes=episodes, frames=self._frames)
+        info = layout.dataset_info(self._stored, self._cameras, fps=self._fps, episodes=episodes, frames=self._frames)
         order = permutation(uids, self._subset_seed)
         self._write_json(layout.INFO_PATH, info)
         stats = global_statistics(self._stored, self._frames, data_files(self._folder))
+        for name in self._cameras:
+            known = [
+                {key: one.get(f"stats/{name}/{key}") for key in layout.STORED_STATISTICS} for one in self._rows.pictures
+            ]
+            stats |= {name: found} if (found := pooled(known)) else {}
         self._write_json(layout.STATS_PATH, stats)
         self._write_json(layout.SUBSETS_PATH, {"seed": self._subset_seed, "uids": order})
         pq.write_table(layout.tasks_table(self._task), self._folder / layout.TASKS_PATH)
@@ -189,12 +222,19 @@ class DatasetWriter:
         pq.write_table(pa.table(metadata), self._folder / layout.METADATA_PATH)
         write_digests(self._folder, self._digests)
         description = self._description | self.made | {"content_hash": self.content_hash}
+        if videos := sorted((self._folder / "videos").glob("*/*/*.mp4")):
+            described = {path.relative_to(self._folder).as_posix(): file_digest(path) for path in videos}
+            description |= {"videos": described}
         self._write_json(layout.DATASET_PATH, sealed(self._folder, description))
         if self.policy:
             shutil.copyfile(self.policy, self._folder / layout.POLICY_PATH)
         faults = Dataset.open(self._folder).verify()
         if faults:
             raise CorruptDatasetError(f"{self.root} was not written: {'; '.join(faults)}. Check the disk.")
+
+    def _video(self, name: str, number: int) -> Path:
+        chunk, file = divmod(number, layout.CHUNK_SIZE)
+        return self._folder / layout.VIDEO_PATH.format(video_key=name, chunk_index=chunk, file_index=file)
 
     def _write_json(self, path: str, content: Mapping[str, Any]) -> None:
         target = self._folder / path
@@ -205,8 +245,9 @@ class DatasetWriter:
 class Admission:
     """Checks each new episode against the dataset's columns and against the episodes before it."""
 
-    def __init__(self, columns: Sequence[Column]) -> None:
+    def __init__(self, columns: Sequence[Column], cameras: Iterable[str] = ()) -> None:
         self._columns = {column.name: column for column in columns}
+        self._cameras = set(cameras)
         self._uids: set[int] = set()
         self.metadata_types: dict[str, type] = {}  # of each metadata key seen so far
 
@@ -223,6 +264,10 @@ class Admission:
 
     def _faults(self, episode: Episode) -> list[str]:
         faults = [f"{name}: missing" for name in self._columns if name not in episode.columns]
+        if self._cameras and (differing := self._cameras ^ episode.cameras.keys()):
+            faults.append(f"cameras: expected {', '.join(sorted(self._cameras))}, differing {', '.join(differing)}")
+        lengths = {name: clip.count for name, clip in episode.cameras.items() if clip.count != len(episode)}
+        faults += [f"{name}: {count} pictures for {len(episode)} steps" for name, count in lengths.items()]
         for name, values in episode.columns.items():
             column = self._columns.get(name)
             faults += column.faults(values) if column else [f"{name}: unknown column"]

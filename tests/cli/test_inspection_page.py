@@ -36,6 +36,7 @@ def inspection(success: int | None) -> Inspection:
         reference="fake@data-1.0.0",
         lengths=np.array([600, 1200, 1800]),
         fps=20,
+        cameras={"front": [48, 64, 3]},
         success=success,
         endings=Endings(terminated=2, cut_off=1, made_up=1),
         spreads=(spread,),
@@ -51,6 +52,7 @@ def test_a_page_sums_up_the_dataset(success: int | None) -> None:
     lines = file.getvalue().splitlines()
     assert lines[0] == "fake@data-1.0.0: 3 episodes, 3,600 steps, 3.0 min"
     assert lines[1].startswith("lengths 600 to 1800, median 1200  ")
+    assert lines[2] == "camera front: 48x64x3"
     assert ("success 1 of 3 episodes (0.33)" in lines) == (success is not None)
     assert any(line.startswith("episodes end: 2 terminated, 1 cut off; 1 next states of") for line in lines)
     table = lines[lines.index("action (2) float32") + 1 :]

@@ -80,7 +80,7 @@ def test_rows_locate_the_episodes_and_hold_their_statistics(
     monkeypatch.setattr(episode_rows, "ROWS_AT_ONCE", rows_at_once)
     rng = np.random.default_rng(0)
     data = [(rng.normal(size=(length, 2)).astype(np.float32), rng.random(length) < 0.5) for length in LENGTHS]
-    writer = EpisodeRows(tmp_path, COLUMNS, "walk")
+    writer = EpisodeRows(tmp_path, COLUMNS, "walk", {})
     for number, episode in enumerate(data):
         writer.append(len(episode[0]), chunk=number, file=10 + number, statistics=episode_statistics(episode))
     writer.close()

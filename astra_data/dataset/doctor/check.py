@@ -18,6 +18,7 @@ from astra_data.core.errors import AstraDataError, BadInputError, CorruptDataset
 from astra_data.dataset import columns as names
 from astra_data.dataset import format as layout
 from astra_data.dataset import plain
+from astra_data.dataset.cameras import clip_fault, read_cameras
 from astra_data.dataset.columns import Array
 from astra_data.dataset.description import (
     SEALED,
@@ -104,6 +105,15 @@ def check(root: Path) -> Report:
             EpisodeChecks(root, info, columns, digests, report).run()
         except AstraDataError as error:
             report.fault("values", str(error))
+    described = plain.read_object(root / layout.DATASET_PATH)
+    digests_of = described.get("videos", {}) if isinstance(described, dict) else {}
+    cameras, unread = read_cameras(root, info, digests_of)
+    for name, fault in unread.items():
+        report.fault("cameras", f"{name}: {fault}")
+    for name, camera in cameras.items():
+        for number, clip in enumerate(camera.clips):
+            if fault := clip_fault(clip):
+                report.fault("cameras", f"{name} in episode {number}: {fault}")
     if is_ours and not report.faults:
         try:
             Dataset.open(root)
@@ -128,6 +138,7 @@ def _info_faults(info: Mapping[str, Any], report: Report) -> list[plain.PlainCol
     if not isinstance(features, dict) or not all(list(checks.values())[1:]):
         return []
     columns, others = plain.plain_columns(features)
+    others = [name for name in others if features[name].get("dtype") not in ("video", "image")]
     if others:
         report.note("features", f"not checked, because they are not numeric: {', '.join(others)}")
     for column in columns:

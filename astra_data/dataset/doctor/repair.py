@@ -12,6 +12,7 @@ import numpy as np
 from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.dataset import columns as names
 from astra_data.dataset import format as layout
+from astra_data.dataset.cameras import Camera, clip_fault, read_cameras
 from astra_data.dataset.columns import Array, Column, Episode, Scalar, new_uid, renamed_metadata
 from astra_data.dataset.description import Digests, altered_files, read_description, read_digests
 from astra_data.dataset.doctor.salvage import whole_runs
@@ -90,10 +91,10 @@ def repair(
     recorded: list[Found] = []
     theirs = {uid for source in sources for uid in source.uids.tolist()}
     task = " / ".join(str(tasks[index]) for index in sorted(tasks)) or "unknown"
-    description, seed = _description(folder, remains, sources), remains.subset_seed
-    with DatasetWriter(
-        out, remains.specs, fps=remains.fps, task=task, description=description, subset_seed=seed
-    ) as writer:
+    description, seed, cameras = _description(folder, remains, sources), remains.subset_seed, remains.cameras
+    features = {name: camera.feature for name, camera in cameras.items()}
+    known_facts: dict[str, Any] = {"task": task, "description": description, "subset_seed": seed}
+    with DatasetWriter(out, remains.specs, fps=remains.fps, cameras=features, **known_facts) as writer:
         for number, (uid, run) in enumerate(whole(notes)):
             known = joined[number] if joined else Joined(uid, {}, is_known=False)
             if not sources:
@@ -112,7 +113,12 @@ def repair(
             if len(tasks) > 1:
                 known.metadata["task"] = tasks.get(int(run.columns[names.TASK_INDEX][0]), "unknown")
             try:
-                episode = Episode(known.uid, remains.values(run, uid), known.metadata)
+                values, at = remains.values(run, uid), int(np.median(run.columns[names.EPISODE_INDEX]))
+                steps = len(next(iter(values.values())))
+                clips = {name: camera.clips[at].part(0, steps) for name, camera in cameras.items()}
+                if unseen := [fault for clip in clips.values() if (fault := clip_fault(clip))]:
+                    raise BadInputError("; ".join(unseen))
+                episode = Episode(known.uid, values, known.metadata, clips)
                 writer.add(episode)
                 roundings.add(run.columns)
             except BadInputError as error:
@@ -145,6 +151,7 @@ class Remains:
     specs: Sequence[Column]  # those of the new dataset
     fps: int
     tasks: Mapping[int, str]
+    cameras: Mapping[str, Camera]
     rows: Rows | None  # how its rows become ours, where LeRobot recorded it without next states; otherwise None
     subset_seed: int
     old: Mapping[str, Any] = field(default_factory=dict)  # its own description
@@ -226,7 +233,14 @@ def remains_of(folder: Path, sources: Sequence[Dataset], notes: list[str]) -> Re
         specs = our_columns(specs, has_tasks=not isinstance(tasks, str) and len(tasks) > 1)
     if is_format_2(folder):
         notes.append(f"LeRobot's format {info['codebase_version']} became {layout.CODEBASE_VERSION}")
-    if others := sorted(info["features"].keys() - rows.stored.keys()):
+    described = read_object(folder / layout.DATASET_PATH)
+    cameras, unread = read_cameras(folder, info, {} if isinstance(described, str) else described.get("videos", {}))
+    for name, fault in unread.items():
+        notes.append(f"{name} is left out: {fault}")
+    for name in [name for name, camera in cameras.items() if all(map(clip_fault, camera.clips))]:
+        unread[name] = str(clip_fault(cameras.pop(name).clips[0]))
+        notes.append(f"{name} is left out: {unread[name]}")
+    if others := sorted(info["features"].keys() - {*rows.stored, *cameras, *unread}):
         notes.append(f"left out, because they are not numeric: {', '.join(others)}")
     kinds = {spec.name: spec.dtype for spec in specs}
     for column in columns:
@@ -237,7 +251,7 @@ def remains_of(folder: Path, sources: Sequence[Dataset], notes: list[str]) -> Re
         notes.append(f"{layout.TASKS_PATH} {tasks}: the task is unknown")
         tasks = {}
     seed = sources[0].subset_seed if sources else 0
-    remains = Remains(info, columns, specs, fps, tasks, None if is_ours else rows, seed)
+    remains = Remains(info, columns, specs, fps, tasks, cameras, None if is_ours else rows, seed)
     # Of what LeRobot's tools made, our metadata is no longer true, where they left it.
     if not has_ours or sources:
         return remains

@@ -178,6 +178,9 @@ def _columns(dataset: Dataset) -> str:
                 meaning = f"{meaning}: {', '.join(labels)}".removeprefix(": ")
             shape = f"({column.size},)"
             rows.append((in_code(column.name), column.dtype, shape, _units(column), meaning))
+    for name, camera in dataset.cameras.items():
+        kind, size = camera.feature["dtype"], ", ".join(map(str, camera.feature["shape"]))
+        rows.append((in_code(name), kind, f"({size})", "", "pictures"))
     plain = [f"`{column.name}`" for column in columns if column.name in RESERVED and not column.meaning]
     order = [f"In {' and '.join(map(in_code, same))}, in order: {', '.join(names)}." for names, same in wide.items()]
     return "\n\n".join(

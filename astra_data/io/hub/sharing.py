@@ -253,7 +253,8 @@ def _check(folder: Path, sums: Mapping[str, str], description: Mapping[str, Any]
     try:
         dataset = Dataset.open(folder)
         faults = check(folder).faults
-        outside = [str(path) for path in dataset.paths if path.relative_to(folder).as_posix() not in sums]
+        videos = {clip.path for camera in dataset.cameras.values() for clip in camera.clips}
+        outside = [str(path) for path in {*dataset.paths, *videos} if path.relative_to(folder).as_posix() not in sums]
         faults += [f"{path} does not belong to it" for path in outside]
         if dataset.content_hash != description.get("content_hash"):
             faults.append("its description changed during the download")

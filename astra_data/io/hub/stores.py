@@ -31,6 +31,7 @@ SUMS_PATH = "SHA256SUMS"
 _NUMBERED = r"chunk-[0-9]{3,}/file-[0-9]{3,}\.parquet"
 _PATH = re.compile(
     rf"(data|meta/episodes)/{_NUMBERED}"
+    r"|videos/[A-Za-z0-9_.-]+/chunk-[0-9]{3,}/file-[0-9]{3,}\.mp4"
     r"|meta/(info\.json|stats\.json|tasks\.parquet)"
     r"|meta/astra/[a-z_]+\.(json|parquet|safetensors)"
 )  # paths of the files of a dataset, by the names of the format; none of them leads out of its folder
@@ -44,7 +45,13 @@ _VERSION = re.compile(rf"[@/](data-)?(?P<version>{VERSION.pattern})/?$")
 
 def dataset_files(root: Path) -> list[str]:
     """List the files that belong to the dataset in folder `root`, relative to it, and no others."""
-    places = ("data/*/*", "meta/*", "meta/astra/*", "meta/episodes/*/*")  # globs follow links, ** would not
+    places = (
+        "data/*/*",
+        "videos/*/*/*",
+        "meta/*",
+        "meta/astra/*",
+        "meta/episodes/*/*",
+    )  # globs follow links, ** would not
     paths = [path.relative_to(root).as_posix() for place in places for path in root.glob(place) if path.is_file()]
     return sorted(path for path in paths if _PATH.fullmatch(path))
 
@@ -62,7 +69,7 @@ def parse_sums(text: str, source: str) -> dict[str, str]:
         if not (found := _LINE.fullmatch(line)):
             faults.append(f"line {number} is not a sha256 with a path")
         elif not _PATH.fullmatch(found[2]):
-            expected = "expected one of a dataset's files, within data/ or meta/"
+            expected = "expected one of a dataset's files, within data/, meta/ or videos/"
             faults.append(f"line {number} has the path {found[2]!r}, {expected}")
         elif found[2] in sums:
             faults.append(f"line {number} lists {found[2]} again")

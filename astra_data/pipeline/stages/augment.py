@@ -12,6 +12,7 @@ robot could have recorded, with three exceptions:
 Held-out episodes are chosen first and never copied. Pairing comes later, so that pairs are exact.
 """
 
+import logging
 from pathlib import Path
 from typing import Annotated, Self
 
@@ -31,6 +32,8 @@ from astra_data.robots.registry import TASKS, task_named
 from astra_data.worlds.plane.relocation import Relocation, Rotations
 from astra_data.worlds.task import Task
 from astra_data.worlds.user_code import is_user_code
+
+_log = logging.getLogger(__name__)
 
 DEFAULT_COPIES = 3
 _OUTCOMES = tuple(column.name for column in OUTCOME_COLUMNS)
@@ -109,10 +112,13 @@ def augment(
     how = {name: getattr(config, name) for name in ("rotations", "translations", "min_steps", "tries")}
     relocation = Relocation(world, margin_m=margin_m, **how)
     held_out, copies = _shares(source, relocation, config, seed)
+    if source.cameras:
+        _log.warning(f"{', '.join(source.cameras)} left out: no camera has seen the moved episodes")
     taken, placed, lost, moving = set(source.uids.tolist()), 0, 0, _moving(source)
     with next_version(
         source,
         "episodes",
+        cameras=False,
         stage="augment",
         config=config.model_dump(mode="json"),
         name=name,

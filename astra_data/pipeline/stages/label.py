@@ -150,7 +150,8 @@ def with_outcomes(task: Task, episode: Episode, seed: int) -> Episode:
     columns |= {REWARD: reward.astype(np.float32), SUCCESS: success.numpy(), **given}
     columns |= {TERMINATED: terminated, TRUNCATED: truncated, DONE: terminated | truncated}
     kept = {key: values[:length] for key, values in columns.items()}
-    return Episode(episode.uid, kept, dict(episode.metadata) | outcome_of(kept))
+    cameras = episode.part(0, length)[1]
+    return Episode(episode.uid, kept, dict(episode.metadata) | outcome_of(kept), cameras)
 
 
 def _abstracted(task: Task, states: Array) -> Tensor:

@@ -21,7 +21,6 @@ from astra_data.dataset.columns import (
     NEXT_STATE,
     STATE,
     Array,
-    Episode,
     in_blocks,
 )
 from astra_data.dataset.compare import column_faults, names_apart
@@ -107,7 +106,7 @@ def pair(
             first = 0
             for episode in episodes:
                 values = {name: as_column(array[first : first + len(episode)]) for name, array in paired.items()}
-                writer.add(Episode(episode.uid, {**episode.columns, **values}, episode.metadata))
+                writer.add(replace(episode, columns={**episode.columns, **values}))
                 first += len(episode)
             steps += first
             rate = steps / stopwatch.seconds

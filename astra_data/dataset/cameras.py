@@ -1,0 +1,348 @@
+"""Cameras: the pictures of episodes in video or parquet files, cut and joined without encoding them again.
+
+A LeRobot dataset has, for each camera, MP4 files of many episodes, or a column of encoded images; an episode is a
+span of one of them. What is copied of a video are groups of pictures: packets from one key frame to the next, so
+pictures stay as they are to the bit. Where an episode begins or ends within a group, the rest of the group is copied
+with it, unless that is longer than `MOST_EXTRA_S`; then its frames are encoded again.
+"""
+
+import io
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from astra_data.core.durable import file_digest
+from astra_data.core.errors import BadInputError, CorruptDatasetError
+from astra_data.dataset import format as layout
+from astra_data.dataset.columns import Clip
+from astra_data.dataset.parquet import read_blocks
+from astra_data.dataset.plain import episodes_files, is_data_path, is_format_2, read_footer, read_places
+
+MOST_EXTRA_S = 1.0
+_ENCODERS = {"av1": "libsvtav1", "h264": "libx264", "hevc": "libx265"}
+_DECODERS = {"libdav1d": "av1", "libaom-av1": "av1"}  # what they decode, where it is not their name
+_OPTIONS = {"g": "2", "crf": "23"}  # key frames as dense as lerobot's, so that any frame is read fast
+
+
+class Camera(NamedTuple):
+    """LeRobot's feature of a camera, and a clip for each episode."""
+
+    feature: Mapping[str, Any]
+    clips: Sequence[Clip]
+
+
+class Span(NamedTuple):
+    """Where a clip was written: the number of the file, and its times there, s."""
+
+    file: int
+    from_s: float
+    to_s: float
+
+
+@dataclass(frozen=True)
+class _Index:
+    """The packets of a video in the order of decoding: presentation times, and which begin a group of pictures."""
+
+    pts: NDArray[np.int64]
+    keys: NDArray[np.intp]
+    time_base: Fraction
+    codec: str
+    header: bytes
+    shape: tuple[int, int, str]
+
+    @cached_property
+    def shown(self) -> NDArray[np.int64]:
+        """The presentation times in order."""
+        return np.sort(self.pts)
+
+    @cached_property
+    def overlaps(self) -> bool:
+        """Whether a group has frames that are shown before its key frame: then it cannot be cut there."""
+        return bool((np.minimum.reduceat(self.pts, self.keys) < self.pts[self.keys]).any())
+
+    def frames(self, clip: Clip) -> NDArray[np.int64]:
+        """Return the presentation times of a clip's frames, (count,)."""
+        wanted_s = clip.start + np.arange(clip.count) * clip.step
+        wanted = wanted_s / float(self.time_base)
+        later = np.searchsorted(self.shown, wanted).clip(max=len(self.pts) - 1)
+        earlier = (later - 1).clip(min=0)
+        nearest = np.where(wanted - self.shown[earlier] < self.shown[later] - wanted, earlier, later)
+        apart_s = np.abs(self.shown[nearest] - wanted) * float(self.time_base)
+        if (wrong := apart_s > clip.step / 2 + 1e-9).any() or len(np.unique(nearest)) < clip.count:
+            time_s = wanted_s[wrong.argmax() if wrong.any() else -1]
+            raise CorruptDatasetError(f"{clip.path} has no frame at {time_s:.3f} s, expected {clip.count} in a row")
+        return np.asarray(self.shown[nearest])
+
+    def groups(self, low: int, high: int) -> tuple[int, int]:
+        """Return the packets, first and end, whose groups show the times `low` to `high`."""
+        ends = [*self.keys[1:], len(self.pts)]
+        first, last = (int(np.searchsorted(self.pts[self.keys], time, side="right")) - 1 for time in (low, high))
+        return int(self.keys[first]), int(ends[last])
+
+
+def _indexed(clip: Clip) -> _Index:
+    if not clip.path.is_file():
+        raise CorruptDatasetError(f"{clip.path} is missing")
+    return _index(clip.path, clip.digest, clip.path.stat().st_mtime_ns)
+
+
+@lru_cache(maxsize=8)
+def _index(path: Path, digest: str | None, _changed_ns: int) -> _Index:
+    import av  # noqa: PLC0415 - slow
+
+    if digest and file_digest(path) != digest:
+        raise CorruptDatasetError(f"{path} was altered after it was written")
+    try:
+        with av.open(str(path)) as container:
+            stream = container.streams.video[0]
+            packets = [packet for packet in container.demux(stream) if packet.pts is not None]
+            keys = np.array([number for number, packet in enumerate(packets) if packet.is_keyframe])
+            pts = np.array([packet.pts for packet in packets], np.int64)
+            context = stream.codec_context
+            shape, header = (context.width, context.height, str(context.pix_fmt)), bytes(context.extradata or b"")
+            codec = _DECODERS.get(context.name, context.name)
+            found = _Index(pts, keys, Fraction(stream.time_base or 1), codec, header, shape)
+    except (av.FFmpegError, IndexError, OSError) as error:
+        raise CorruptDatasetError(f"{path} cannot be read as a video ({error})") from None
+    if not len(keys) or keys[0] != 0:
+        raise CorruptDatasetError(f"{path} does not begin with a key frame")
+    return found
+
+
+def read_cameras(
+    root: Path, info: Mapping[str, Any], digests: Mapping[str, str]
+) -> tuple[dict[str, Camera], dict[str, str]]:
+    """Return the cameras of the LeRobot dataset in `root`, and what is wrong with those that cannot be read.
+
+    `digests` are the known ones of its video files, by their paths in `root`.
+    """
+    cameras, faults = dict[str, Camera](), dict[str, str]()
+    features = info["features"] if isinstance(info.get("features"), Mapping) else {}
+    for name, feature in features.items():
+        if isinstance(feature, Mapping) and (kind := feature.get("dtype")) in ("video", "image"):
+            try:
+                clips = _of_format_2 if is_format_2(root) else _of_video if kind == "video" else _of_images
+                found = list(clips(root, info, name))
+                named = ((clip, digests.get(clip.path.relative_to(root).as_posix())) for clip in found)
+                cameras[name] = Camera(feature, [replace(clip, digest=digest) for clip, digest in named])
+                if len(found) != info["total_episodes"]:
+                    raise ValueError(f"{len(found)} episodes, expected {info['total_episodes']}")
+                if gone := sorted({str(clip.path.relative_to(root)) for clip in found if not clip.path.is_file()}):
+                    faults[name] = f"{', '.join(gone[:3])}{' and others' * (len(gone) > 3)} missing"
+            except (CorruptDatasetError, KeyError, IndexError, TypeError, ValueError) as error:
+                faults[name] = f"its places in meta/episodes cannot be read ({error})"
+    return {name: camera for name, camera in cameras.items() if name not in faults}, faults
+
+
+def _rows(root: Path, names: Sequence[str], camera: str) -> Iterator[dict[str, Any]]:
+    """Yield the values `names` of each episode, and its statistics of a camera."""
+    columns = [*names, *(f"stats/{camera}/{key}" for key in layout.STORED_STATISTICS)]
+    yield from (row for block in read_blocks(episodes_files(root), columns) for row in block.to_pylist())
+
+
+def _statistics(row: Mapping[str, Any], camera: str) -> dict[str, Any]:
+    found = {key: row.get(f"stats/{camera}/{key}") for key in layout.STORED_STATISTICS}
+    return {key: value for key, value in found.items() if value is not None}
+
+
+def _of_video(root: Path, info: Mapping[str, Any], name: str) -> Iterator[Clip]:
+    pattern = str(info["video_path"]).replace("{video_key}", name)
+    if not is_data_path(pattern):
+        raise ValueError(f"expected a video_path inside the folder, got {info['video_path']!r}")
+    for row in _rows(root, ["length", *(f"videos/{name}/{key}" for key in layout.VIDEO_PLACE)], name):
+        chunk, file, from_s, to_s = (row[f"videos/{name}/{key}"] for key in layout.VIDEO_PLACE)
+        if abs((to_s - from_s) * info["fps"] - row["length"]) > 1:
+            raise ValueError(f"{to_s - from_s:.3f} s for {row['length']} frames")
+        path = root / pattern.format(chunk_index=chunk, file_index=file)
+        yield Clip(path, name, from_s, 1 / info["fps"], row["length"], None, _statistics(row, name))
+
+
+def _of_images(root: Path, info: Mapping[str, Any], name: str) -> Iterator[Clip]:
+    known = "length", "dataset_from_index", "data/chunk_index", "data/file_index"
+    firsts: dict[Path, int] = {}
+    if not is_data_path(info["data_path"]):
+        raise ValueError(f"expected a data_path inside the folder, got {info['data_path']!r}")
+    for row in _rows(root, known, name):
+        length, first, chunk, file = (row[key] for key in known)
+        path = root / info["data_path"].format(chunk_index=chunk, file_index=file)
+        yield Clip(path, name, first - firsts.setdefault(path, first), 1, length, None, _statistics(row, name))
+
+
+def _of_format_2(root: Path, info: Mapping[str, Any], name: str) -> Iterator[Clip]:
+    for number, place in sorted(read_places(root, info)[0].items()):
+        if info["features"][name]["dtype"] == "image" and place.path:
+            yield Clip(place.path, name, 0, 1, place.length)
+            continue
+        chunk = number // int(info.get("chunks_size", layout.CHUNK_SIZE))
+        path = root / f"videos/chunk-{chunk:03d}/{name}/episode_{number:06d}.mp4"
+        yield Clip(path, name, 0, 1 / info["fps"], place.length)
+
+
+def clip_fault(clip: Clip) -> str | None:
+    """Return what is wrong with the file of a clip, if its pictures are not all there; nothing is decoded."""
+    try:
+        if clip.path.suffix == ".mp4":
+            _indexed(clip).frames(clip)
+        elif any(not one["bytes"] for one in images(clip)):
+            return f"{clip.path} has no picture in a row of {clip.camera}"
+    except CorruptDatasetError as error:
+        return str(error)
+    return None
+
+
+def images(clip: Clip) -> list[dict[str, Any]]:
+    """Return the stored images of a clip in a parquet file, its bytes and path each."""
+    rows, footer = np.rint(clip.start + np.arange(clip.count) * clip.step).astype(int), read_footer(clip.path)
+    if isinstance(footer, str) or footer[0] <= rows[-1] or clip.camera not in footer[1].names:
+        fault = footer if isinstance(footer, str) else f"has no images of {clip.camera} up to row {rows[-1]}"
+        raise CorruptDatasetError(f"{clip.path} {fault}")
+    wanted = np.zeros(footer[0], bool)
+    wanted[rows] = True
+    found = [one for block in read_blocks([clip.path], [clip.camera], wanted) for one in block[0].to_pylist()]
+    if len(found) != clip.count or not all(isinstance(one, dict) for one in found):
+        raise CorruptDatasetError(f"{clip.path} has {len(found)} images of {clip.camera}, expected {clip.count}")
+    return found
+
+
+def decoded(clip: Clip) -> NDArray[Any]:
+    """Return the pictures of a clip, (T, H, W, 3) uint8; those of a depth camera are (T, H, W) uint16."""
+    if clip.path.suffix == ".mp4":
+        return np.stack([_array(frame) for frame in _decode(clip)])
+    from PIL import Image  # noqa: PLC0415 - slow
+
+    return np.stack([np.asarray(Image.open(io.BytesIO(one["bytes"]))) for one in images(clip)])
+
+
+def _array(frame: Any) -> NDArray[Any]:  # noqa: ANN401 - of PyAV
+    is_depth = str(frame.format.name).startswith("gray1")
+    return np.asarray(frame.to_ndarray(format="gray16le" if is_depth else "rgb24"))
+
+
+def _decode(clip: Clip) -> Iterator[Any]:
+    import av  # noqa: PLC0415 - slow
+
+    wanted = _indexed(clip).frames(clip)
+    left = set(wanted.tolist())
+    with av.open(str(clip.path)) as container:
+        stream = container.streams.video[0]
+        container.seek(int(wanted[0]), stream=stream)
+        for frame in container.decode(stream):
+            if frame.pts in left:
+                left.discard(frame.pts)
+                yield frame
+            if not left:
+                return
+    raise CorruptDatasetError(f"{clip.path}: {len(left)} of {clip.count} frames cannot be decoded")
+
+
+class ClipWriter:
+    """Writes clips of one camera, one after another, to the MP4 files that `place` names by their numbers."""
+
+    def __init__(self, place: Callable[[int], Path], fps: int) -> None:
+        self._place, self._fps = place, fps
+        self._file, self._time_s, self._bytes = -1, 0.0, 0
+        self._output: Any = None
+        self._stream: Any = None
+        self._kind: object = None
+
+    def add(self, clip: Clip) -> Span:
+        """Append a clip, whose step may be longer than that of its file; return where it is."""
+        index = _indexed(clip)
+        times = index.frames(clip)
+        packets = index.groups(int(times[0]), int(times[-1]))
+        needed = int(np.searchsorted(index.shown, times[-1]) - np.searchsorted(index.shown, times[0])) + 1
+        if index.overlaps or (packets[1] - packets[0] - needed) / self._fps > MOST_EXTRA_S:
+            return self._encode(clip, index)
+        return self._copy(clip, index, packets, times)
+
+    def _copy(self, clip: Clip, index: _Index, packets: tuple[int, int], times: NDArray[np.int64]) -> Span:
+        import av  # noqa: PLC0415 - slow
+
+        self._open((index.codec, index.header, index.shape))
+        begin, left = int(index.pts[packets[0]]), packets[1] - packets[0]
+        with av.open(str(clip.path)) as container:
+            source = container.streams.video[0]
+            if self._stream is None:
+                self._stream = self._output.add_stream_from_template(source, opaque=True)
+                self._stream.time_base = source.time_base
+            offset = round(self._time_s / index.time_base) - begin
+            container.seek(begin, stream=source)
+            for packet in container.demux(source):
+                if packet.pts is None or packet.pts < begin:
+                    continue
+                packet.pts, packet.dts = (
+                    packet.pts + offset,
+                    (packet.pts if packet.dts is None else packet.dts) + offset,
+                )
+                packet.stream = self._stream
+                self._mux(packet)
+                left -= 1
+                if not left:
+                    break
+        frame_s = float(np.median(np.diff(index.shown))) * float(index.time_base) if len(index.pts) > 1 else clip.step
+        self._time_s = float((int(index.pts[slice(*packets)].max()) + offset) * index.time_base) + frame_s
+        from_s = float((int(times[0]) + offset) * index.time_base)
+        return Span(self._file, from_s, from_s + clip.count * clip.step)
+
+    def _encode(self, clip: Clip, index: _Index) -> Span:
+        if index.codec not in _ENCODERS:
+            cut = f"to cut {index.codec} within a group of pictures, its frames are encoded again"
+            raise BadInputError(f"{clip.path}: {cut}, which is known of {', '.join(_ENCODERS)}")
+        self._open((_ENCODERS[index.codec], index.shape))
+        if self._stream is None:
+            self._stream = self._output.add_stream(_ENCODERS[index.codec], rate=self._fps, options=_OPTIONS)
+            self._stream.width, self._stream.height, self._stream.pix_fmt = index.shape
+        from_s, number = self._time_s, round(self._time_s * self._fps)
+        for count, frame in enumerate(_decode(clip)):
+            frame.pts, frame.time_base = number + count, Fraction(1, self._fps)
+            frame.pict_type = 1 if count == 0 else 0  # each clip begins with a key frame
+            for packet in self._stream.encode(frame):
+                self._mux(packet)
+        self._time_s = from_s + clip.count / self._fps
+        return Span(self._file, from_s, self._time_s)
+
+    def _mux(self, packet: Any) -> None:  # noqa: ANN401 - of PyAV
+        self._bytes += packet.size
+        self._output.mux(packet)
+
+    def _open(self, kind: object) -> None:
+        """Go on in this file, or begin another where the codec is another or it is full."""
+        if kind == self._kind and self._bytes < layout.VIDEO_FILE_SIZE_MB * 2**20:
+            return
+        import av  # noqa: PLC0415 - slow
+
+        self.close()
+        self._file += 1
+        path = self._place(self._file)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._output, self._stream, self._kind = av.open(str(path), "w"), None, kind
+        self._time_s, self._bytes = 0.0, 0
+
+    def close(self) -> None:
+        """Finish the last file."""
+        if self._output is not None:
+            if self._kind and len(self._kind) == 2:  # type: ignore[arg-type]  # what the encoder still has
+                self._output.mux(self._stream.encode())
+            self._output.close()
+        self._output = None
+
+
+def pooled(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the statistics over several episodes from those of each, as lerobot does; quantiles are estimates."""
+    known = {key for key in layout.STORED_STATISTICS if all(part.get(key) is not None for part in parts)}
+    if not parts or not known >= {"count", "min", "max", "mean", "std"}:
+        return {}
+    values = {key: np.array([part[key] for part in parts], float) for key in known}
+    count = values["count"].reshape(-1, *([1] * (values["mean"].ndim - 1)))
+    found = {key: (value * count).sum(axis=0) / count.sum() for key, value in values.items()}
+    spread = values["std"] ** 2 + (values["mean"] - found["mean"]) ** 2
+    found |= {"min": values["min"].min(axis=0), "max": values["max"].max(axis=0)}
+    found |= {"std": np.sqrt((spread * count).sum(axis=0) / count.sum())}
+    counts = {"count": [int(values["count"].sum())]}
+    return {key: value.tolist() for key, value in found.items()} | counts

@@ -1,0 +1,250 @@
+"""New versions of a dataset with other steps: trimmed, without some steps, or at another rate."""
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from astra_data.core.arrays import Bools, Floats, as_rows
+from astra_data.core.config import did_you_mean
+from astra_data.core.errors import BadInputError
+from astra_data.dataset.columns import (
+    DONE,
+    GOAL,
+    NEXT_STATE,
+    REWARD,
+    STATE,
+    SUCCESS,
+    TERMINATED,
+    TRUNCATED,
+    Array,
+    Column,
+    Episode,
+    new_uid,
+)
+from astra_data.dataset.reader import Dataset
+from astra_data.dataset.versions import next_version
+
+_COMPARED = {"<=": "less_equal", ">=": "greater_equal", "==": "equal", "!=": "not_equal", "<": "less", ">": "greater"}
+"""Comparisons, and NumPy's functions of them."""
+_CONDITION = re.compile(r"\s*(.+?)\s*(<=|>=|==|!=|<|>)\s*(\S+)\s*")
+_OBSERVED = re.compile(r"(next\.)?observation\.")
+_TURNS = {"rad": 2 * np.pi, "deg": 360.0}
+
+
+def trim(
+    source: Dataset,
+    *,
+    start_s: float = 0.0,
+    end_s: float = 0.0,
+    still: bool = False,
+    without: str | None = None,
+    name: str | None = None,
+    out: Path | None = None,
+) -> Path:
+    """Write `source` with shorter episodes; an episode of which nothing is left is left out.
+
+    Where steps go from the middle of an episode, it becomes several: the first keeps its uid, the others have
+    new ones, and it as "source_episode". An episode that lost its end is marked as truncated there.
+
+    Args:
+        source: the dataset.
+        start_s: time to remove from the start of each episode, s.
+        end_s: time to remove from its end, s.
+        still: remove the steps at either end in which the state does not change.
+        without: remove the steps in which a value meets this condition, such as "v < 0.05".
+        name: of the new dataset, as for `subset`.
+        out: its folder, as for `subset`.
+
+    Raises:
+        BadInputError: nothing is asked for, or would be left, or a value in the condition is not known.
+    """
+    config = {"start_s": start_s, "end_s": end_s, "still": still, "without": without}
+    if not any(config.values()) or start_s < 0 or end_s < 0:
+        raise BadInputError("trim: expected a time at the start or the end, --still or --without a condition, got none")
+    condition = _condition(source, without) if without else None
+    first, last = (round(seconds * source.info["fps"]) for seconds in (start_s, end_s))
+
+    def kept(episode: Episode) -> Bools:
+        left = np.zeros(len(episode), bool)
+        left[first : len(episode) - last] = True
+        if still and (moving := np.flatnonzero(left & _moves(episode))).size:
+            left[: moving[0]] = left[moving[-1] + 1 :] = False
+        elif still:
+            left[:] = False
+        return left & ~condition(episode) if condition else left
+
+    known = set(source.uids.tolist())
+    pieces = (piece for episode in source.episodes() for piece in _pieces(episode, kept(episode), source, known))
+    return _write(
+        source, list(source.schema), pieces, source.info["fps"], stage="trim", config=config, name=name, out=out
+    )
+
+
+def resample(source: Dataset, fps: int, *, name: str | None = None, out: Path | None = None) -> Path:
+    """Write `source` at another rate: commands are held, states interpolated, rewards summed, times true.
+
+    Angles (unit rad or deg) are interpolated the shorter way, quaternions as such. Columns of a pairing are left
+    out, since steps of another length land elsewhere: pair it again. What is left of an episode after its last
+    whole step adds its reward and ending to that step; an episode shorter than a step is left out.
+
+    Raises:
+        BadInputError: the rate is the present one, or no episode is long enough.
+    """
+    if fps < 1 or fps == source.info["fps"]:
+        raise BadInputError(f"resample: expected another rate than {source.info['fps']} per second, got {fps}")
+    if source.cameras and source.info["fps"] % fps:
+        raise BadInputError(
+            f"resample: {source.reference} has cameras, whose pictures are not interpolated: expected a rate that "
+            f"divides {source.info['fps']}, got {fps}"
+        )
+    schema = [column for column in source.schema if not column.name.startswith("abstract.")]
+    slower = (slow for episode in source.episodes() if (slow := _resampled(episode, schema, source.info["fps"], fps)))
+    config = {"fps": fps, "from_fps": source.info["fps"]}
+    return _write(source, schema, slower, fps, stage="resample", config=config, name=name, out=out)
+
+
+def _write(
+    source: Dataset,
+    schema: list[Column],
+    episodes: Iterator[Episode],
+    fps: int,
+    *,
+    stage: str,
+    config: Mapping[str, Any],
+    name: str | None,
+    out: Path | None,
+) -> Path:
+    with next_version(
+        source, "columns", stage=stage, config=config, name=name, out=out, fps=fps, schema=schema
+    ) as writer:
+        count = 0
+        for episode in episodes:
+            writer.add(episode)
+            count += 1
+        if not count:
+            raise BadInputError(f"{source.reference}: nothing of its {len(source)} episodes would be left")
+    return writer.root
+
+
+def _condition(source: Dataset, text: str) -> Any:  # noqa: ANN401 - episode to (T,) bool
+    """Return a function that says in which steps of an episode "NAME < NUMBER" holds."""
+    parts = _CONDITION.fullmatch(text)
+    known = {
+        label: (column, index)
+        for column in source.schema
+        for index, value in enumerate(column.labels)
+        for label in ([column.name] if column.size == 1 else [value, f"{column.name}.{value}"])
+    }
+    try:
+        value, compared, number = parts.groups() if parts else ("", "", "")
+        limit = {"true": 1.0, "false": 0.0}.get(number.lower()) if number.isalpha() else float(number)
+        if limit is None:
+            raise ValueError
+    except ValueError:
+        raise BadInputError(
+            f"expected a condition such as 'v < 0.05' or 'next.success == true', got {text!r}"
+        ) from None
+    if value not in known:
+        raise BadInputError(f"{source.reference} has no value {value!r}{did_you_mean(value, known)}")
+    column, index = known[value]
+    compare = getattr(np, _COMPARED[compared])
+    return lambda episode: compare(as_rows(episode.columns[column.name])[:, index].astype(np.float64), limit)
+
+
+def _moves(episode: Episode) -> Bools:
+    state = as_rows(episode.columns[STATE])
+    after = as_rows(episode.columns.get(NEXT_STATE, np.concatenate([state[1:], state[-1:]])))
+    return np.asarray((state != after).any(axis=1))
+
+
+def _pieces(episode: Episode, kept: Bools, source: Dataset, known: set[int]) -> Iterator[Episode]:
+    """Yield the runs of steps that are kept."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], kept, [False]]).astype(np.int8)))
+    for number, (first, end) in enumerate(zip(edges[::2], edges[1::2], strict=True)):
+        if (first, end) == (0, len(episode)):
+            yield episode
+            return
+        columns, cameras = episode.part(first, end)
+        if end < len(episode):
+            for name in {TRUNCATED, DONE} & columns.keys():
+                columns[name][-1] = True
+        uid, metadata = episode.uid, _facts(columns, episode.metadata)
+        if number:
+            uid = new_uid(uid, f"{source.content_hash} {first} ".encode(), known | {uid})
+            known.add(uid)
+            metadata.setdefault("source_episode", episode.uid)
+        yield replace(episode, uid=uid, columns=columns, metadata=metadata, cameras=cameras)
+
+
+def _facts(columns: Mapping[str, Array], metadata: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the metadata, with return and success of the steps that are left."""
+    changed = dict(metadata)
+    if "return" in changed and REWARD in columns:
+        changed["return"] = float(columns[REWARD].sum(dtype=np.float64))
+    if "success" in changed and SUCCESS in columns:
+        changed["success"] = bool(columns[SUCCESS].any())
+    return changed
+
+
+def _resampled(episode: Episode, schema: Sequence[Column], before: int, fps: int) -> Episode | None:
+    has_next = NEXT_STATE in episode.columns
+    duration_s = (len(episode) - (not has_next)) / before
+    steps = int(duration_s * fps + 1e-6) + (not has_next)
+    if steps < 1:
+        return None
+    times_s = np.arange(steps + 1) / fps
+    row = np.minimum((times_s * before + 1e-6).astype(int), len(episode))
+    columns: dict[str, Array] = {}
+    for column in schema:
+        values = episode.columns[column.name]
+        if column.name == REWARD:
+            sums = np.concatenate([[0.0], np.cumsum(values, dtype=np.float64)])
+            found = np.diff(sums[[*row[:-1], len(episode)]])
+        elif column.name in (TERMINATED, TRUNCATED, DONE, SUCCESS):
+            counts = np.concatenate([[0], np.cumsum(values)])
+            found = np.diff(counts[[*row[:-1], len(episode)]]) > 0
+        elif (
+            column.dtype == "float32"
+            and column.name.removeprefix("next.").startswith("observation.")
+            and column.name != GOAL
+        ):
+            of = episode.columns[STATE] if column.name == NEXT_STATE else values
+            if has_next and column.name in (STATE, NEXT_STATE):
+                of = np.concatenate([of, episode.columns[NEXT_STATE][-1:]])
+            at = times_s[1:] if column.name == NEXT_STATE else times_s[:-1]
+            found = _interpolated(as_rows(of).astype(np.float64), at * before, column).reshape(steps, *values.shape[1:])
+        else:
+            found = values[np.minimum(row[:-1], len(episode) - 1)]
+        columns[column.name] = found.astype(values.dtype)
+    cameras = {name: clip.part(0, steps * (before // fps), before // fps) for name, clip in episode.cameras.items()}
+    return replace(episode, columns=columns, metadata=_facts(columns, episode.metadata), cameras=cameras)
+
+
+def _interpolated(values: Floats, at: Floats, column: Column) -> Floats:
+    """Return rows of `values` (N, D) `at` places between 0 and N - 1, (M, D)."""
+    recorded = values
+    values = values.copy()
+    turns = {index: _TURNS[unit] for index, unit in enumerate(column.units) if unit in _TURNS}
+    for index, turn in turns.items():
+        values[:, index] = np.unwrap(values[:, index], period=turn)
+    low = np.minimum(at.astype(int), len(values) - 1)
+    high = np.minimum(low + 1, len(values) - 1)
+    share = np.clip(at - low, 0.0, 1.0)[:, None]
+    share[share < 1e-6] = 0.0
+    first, second = values[low], values[high].copy()
+    for role, part in column.roles:
+        if role == "quaternion":
+            second[:, part] *= np.where((first[:, part] * second[:, part]).sum(axis=1, keepdims=True) < 0, -1.0, 1.0)
+    found = np.where(share == 0.0, first, (1 - share) * first + share * second)
+    for role, part in column.roles:
+        if role == "quaternion":
+            found[:, part] /= np.linalg.norm(found[:, part], axis=1, keepdims=True)
+    for index, turn in turns.items():
+        if (values[:, index] != recorded[:, index]).any():  # wrapped angles stay so
+            least = 0.0 if recorded[:, index].min() >= 0.0 else -turn / 2
+            found[:, index] = (found[:, index] - least) % turn + least
+    return np.asarray(found)

@@ -1,0 +1,232 @@
+import io
+import shutil
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from fake_dataset import COLUMNS, fake_episode, writer
+from PIL import Image
+
+from astra_data.core.errors import BadInputError, CorruptDatasetError
+from astra_data.dataset.cameras import ClipWriter, clip_fault, decoded, pooled
+from astra_data.dataset.columns import Clip
+from astra_data.dataset.doctor.check import check
+from astra_data.dataset.doctor.repair import repair
+from astra_data.dataset.edit import delete, merge, subset
+from astra_data.dataset.format import IMAGE
+from astra_data.dataset.frames import Frames
+from astra_data.dataset.inspection import inspect_dataset
+from astra_data.dataset.reader import Dataset
+from astra_data.dataset.timing import resample, trim
+from astra_data.io.hub.card import Notes, render_card
+from astra_data.io.hub.stores import dataset_files
+
+av = pytest.importorskip("av")
+FRONT, TOP, FPS = "observation.images.front", "observation.images.top", 20
+LENGTHS = {3: 14, 8: 9, 5: 30}
+"""Steps of the episodes by their uids."""
+FEATURES: dict[str, Any] = {
+    FRONT: {"dtype": "video", "shape": [64, 64, 3], "names": ["height", "width", "channels"]},
+    TOP: {"dtype": "image", "shape": [4, 4, 3], "names": ["height", "width", "channels"]},
+}
+STATISTICS = {key: [[[0.5]], [[0.25]], [[0.125]]] for key in ("min", "max", "mean", "std")}
+
+
+def film(path: Path, frames: int, codec: str = "libx264", **options: str) -> Path:
+    """Write a video of which every frame is another."""
+    with av.open(str(path), "w") as file:
+        stream = file.add_stream(codec, rate=FPS, options={"g": "2", **options})
+        stream.width, stream.height, stream.pix_fmt = 64, 64, "yuv420p"
+        for number in range(frames):
+            picture = np.full((64, 64, 3), 40 + number, np.uint8)
+            picture[number % 64, :, 1] = 255
+            file.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+        file.mux(stream.encode())
+    return path
+
+
+def stills(path: Path, frames: int) -> Path:
+    """Write a column of images, of which every one is another."""
+    rows = []
+    for number in range(frames):
+        stored = io.BytesIO()
+        Image.fromarray(np.full((4, 4, 3), number, np.uint8)).save(stored, "PNG")
+        rows.append({"bytes": stored.getvalue(), "path": f"{number}.png"})
+    pq.write_table(pa.table({TOP: pa.array(rows, IMAGE)}), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    """Three episodes with two cameras; the first frame of the files belongs to none."""
+    folder, total = tmp_path_factory.mktemp("cameras"), sum(LENGTHS.values()) + 1
+    video, images = film(folder / "video.mp4", total), stills(folder / "images.parquet", total)
+    first = 1
+    with writer(folder / "set", cameras=FEATURES) as opened:
+        for uid, steps in LENGTHS.items():
+            statistics = STATISTICS | {"count": [steps]}
+            clips = {
+                FRONT: Clip(video, FRONT, first / FPS, 1 / FPS, steps, statistics=statistics),
+                TOP: Clip(images, TOP, first, 1, steps),
+            }
+            opened.add(replace(fake_episode(uid, steps), cameras=clips))
+            first += steps
+    return Dataset.open(folder / "set")
+
+
+def pictures(dataset: Dataset, uid: int) -> tuple[Any, Any]:
+    index = dataset.uids.tolist().index(uid)
+    return dataset.pictures(FRONT, index), dataset.pictures(TOP, index)
+
+
+def assert_shows(root: Path, source: Dataset, expected: dict[int, tuple[int, slice]]) -> None:
+    """Check the pictures of each uid: those of a uid of `source`, of these steps."""
+    found = Dataset.open(root)
+    assert check(root).faults == [] and sorted(found.uids.tolist()) == sorted(expected)
+    for uid, (of, steps) in expected.items():
+        for one, before in zip(pictures(found, uid), pictures(source, of), strict=True):
+            np.testing.assert_array_equal(one, before[steps])
+
+
+ALL = {uid: (uid, slice(None)) for uid in LENGTHS}
+
+
+def test_a_written_camera_shows_the_frames_that_it_was_given(source: Dataset) -> None:
+    first = 1
+    for uid, steps in LENGTHS.items():
+        front, top = pictures(source, uid)
+        assert front.shape == (steps, 64, 64, 3) and top.shape == (steps, 4, 4, 3)
+        assert top[:, 0, 0, 0].tolist() == list(range(first, first + steps))
+        assert front[:, :, :, 1].mean(axis=2).argmax(axis=1).tolist() == list(range(first, first + steps))  # the line
+        first += steps
+    assert source.statistics()[FRONT]["mean"] == [[[0.5]], [[0.25]], [[0.125]]]
+    assert source.statistics()[FRONT]["count"] == [sum(LENGTHS.values())]
+    assert FRONT not in source.features and FRONT in repr(source)
+
+
+def test_edits_keep_the_pictures_of_the_steps_that_are_left(source: Dataset, tmp_path: Path) -> None:
+    half = subset(source, episodes=2, out=tmp_path / "subset")
+    assert_shows(half, source, {uid: ALL[uid] for uid in Dataset.open(half).uids.tolist()})
+    assert_shows(delete(source, [8], out=tmp_path / "delete"), source, {uid: ALL[uid] for uid in (3, 5)})
+    ends = slice(3, -2)
+    trimmed = trim(source, start_s=0.15, end_s=0.1, out=tmp_path / "trim")
+    assert_shows(trimmed, source, {uid: (uid, ends) for uid in LENGTHS})
+    again = trim(Dataset.open(trimmed), start_s=0.05, out=tmp_path / "again")
+    assert_shows(again, source, {uid: (uid, slice(4, -2)) for uid in LENGTHS})
+    merged = merge([source, Dataset.open(half)], new_uids=True, out=tmp_path / "merge")
+    copies = dict(zip(Dataset.open(merged).uids.tolist(), [*LENGTHS, *Dataset.open(half).uids.tolist()], strict=True))
+    assert_shows(merged, source, {uid: ALL[of] for uid, of in copies.items()})
+    slow = {uid: (uid, slice(0, None, 4)) for uid in LENGTHS}
+    assert_shows(resample(source, 5, out=tmp_path / "slow"), source, slow)
+    repair(source.root, out=tmp_path / "repaired")
+    assert_shows(tmp_path / "repaired", source, ALL)
+
+
+def test_lerobots_loader_shows_the_same_pictures(lerobot: SimpleNamespace, source: Dataset, tmp_path: Path) -> None:
+    for root in (source.root, trim(source, start_s=0.15, out=tmp_path / "trim")):
+        ours = Dataset.open(root)
+        loaded = lerobot.dataset.LeRobotDataset("a/b", root=root, video_backend="pyav")
+        for episode, start in enumerate(ours.starts.tolist()):
+            items = [loaded[start + step] for step in range(int(ours.lengths[episode]))]
+            for name in FEATURES:
+                theirs = np.stack([item[name].numpy() for item in items]).transpose(0, 2, 3, 1)
+                np.testing.assert_allclose(theirs * 255, ours.pictures(name, episode), atol=1e-3)
+
+
+@pytest.mark.parametrize(("codec", "group"), [("libx264", "12"), ("libx264", "250"), ("libx265", "250")])
+def test_frames_are_cut_within_groups_and_encoded_again_in_long_ones(codec: str, group: str, tmp_path: Path) -> None:
+    clip = Clip(film(tmp_path / "film.mp4", 90, codec, g=group), FRONT, 31 / FPS, 1 / FPS, 40)
+    written = ClipWriter(lambda number: tmp_path / f"{number}.mp4", FPS)
+    spans = [written.add(clip), written.add(clip.part(5, 25))]
+    written.close()
+    assert [round((span.to_s - span.from_s) * FPS) for span in spans] == [40, 20]
+    copies = [
+        decoded(Clip(tmp_path / f"{at.file}.mp4", FRONT, at.from_s, 1 / FPS, n))
+        for at, n in zip(spans, (40, 20), strict=True)
+    ]
+    before = decoded(clip)
+    assert np.abs(copies[0].astype(int) - before).mean() < 2 and np.abs(copies[1].astype(int) - before[5:25]).mean() < 2
+    if group == "12":
+        np.testing.assert_array_equal(copies[0], before)
+        np.testing.assert_array_equal(copies[1], before[5:25])
+        bases = [av.open(str(path)).streams.video[0].time_base for path in (clip.path, tmp_path / "0.mp4")]
+        assert bases[0] == bases[1]  # lerobot's merge joins files with one
+
+
+def damaged(source: Dataset, root: Path, change: str) -> Path:
+    shutil.copytree(source.root, root)
+    (video,) = (root / "videos").rglob("*.mp4")
+    if change == "missing":
+        video.unlink()
+    else:
+        content = bytearray(video.read_bytes())
+        content[len(content) // 2] ^= 255
+        video.write_bytes(content)
+    return root
+
+
+@pytest.mark.parametrize("change", ["missing", "altered"])
+def test_a_damaged_video_is_refused_and_the_rest_is_recovered(source: Dataset, tmp_path: Path, change: str) -> None:
+    root = damaged(source, tmp_path / "damaged", change)
+    assert FRONT in check(root).faults[0] and change in check(root).faults[0]
+    with pytest.raises(CorruptDatasetError, match=change):
+        subset(Dataset.open(root), episodes=2, out=tmp_path / "half")
+    assert not (tmp_path / "half").exists()
+    notes = repair(root, out=tmp_path / "repaired").notes
+    assert any(FRONT in note and "left out" in note for note in notes)
+    whole = Dataset.open(tmp_path / "repaired")
+    assert list(whole.cameras) == [TOP] and len(whole) == len(LENGTHS)
+
+
+def test_cameras_are_shown_and_shared_with_their_dataset(source: Dataset) -> None:
+    assert inspect_dataset(source).cameras == {FRONT: [64, 64, 3], TOP: [4, 4, 3]}
+    assert f"| `{FRONT}` | video | (64, 64, 3) |" in render_card(source, Notes())
+    assert "videos/observation.images.front/chunk-000/file-000.mp4" in dataset_files(source.root)
+
+
+def test_pictures_load_as_frames(source: Dataset) -> None:
+    frames = Frames.load(source, ["action"], episodes=[2], cameras=[FRONT])
+    np.testing.assert_array_equal(frames.columns[FRONT].numpy(), source.pictures(FRONT, 2))
+    assert next(iter(frames.windows(4).batches(2)))[FRONT].shape == (2, 4, 64, 64, 3)
+
+
+def test_what_does_not_fit_is_refused(source: Dataset, tmp_path: Path) -> None:
+    clips = next(source.episodes()).cameras
+    cases: Sequence[tuple[dict[str, Clip], str]] = [
+        ({FRONT: clips[FRONT]}, TOP),
+        ({**clips, FRONT: clips[FRONT].part(0, 5)}, "5 pictures for 14 steps"),
+    ]
+    for given, expected in cases:
+        with pytest.raises(BadInputError, match=expected), writer(tmp_path / "out", cameras=FEATURES) as opened:
+            opened.add(replace(fake_episode(3, 14), cameras=given))
+    with pytest.raises(BadInputError, match="divides 20, got 3"):
+        resample(source, 3, out=tmp_path / "out")
+    with pytest.raises(BadInputError, match=f"camera 'side'; it has {FRONT}"):
+        source.pictures("side", 0)
+    with writer(tmp_path / "blind", columns=COLUMNS) as opened:
+        opened.add(fake_episode(99, 4))
+    with pytest.raises(BadInputError, match=FRONT):
+        merge([source, Dataset.open(tmp_path / "blind")], out=tmp_path / "out")
+    beyond = Clip(clips[FRONT].path, FRONT, 2.5, 1 / FPS, 9)
+    assert "no frame at" in str(clip_fault(beyond)) and clip_fault(clips[FRONT]) is None
+    single = Clip(film(tmp_path / "single.mp4", 1), FRONT, 0.0, 1 / FPS, 1)
+    assert decoded(single).shape == (1, 64, 64, 3) and clip_fault(replace(single, count=2)) is not None
+
+
+def test_statistics_of_episodes_are_pooled() -> None:
+    rng = np.random.default_rng(0)
+    parts = [rng.uniform(size=(count, 3, 1, 1)) for count in (4, 10)]
+    each = [
+        {key: getattr(np, key)(part, axis=0).tolist() for key in ("min", "max", "mean", "std")} | {"count": [len(part)]}
+        for part in parts
+    ]
+    found, every = pooled(each), np.concatenate(parts)
+    for key in ("min", "max", "mean", "std"):
+        np.testing.assert_allclose(found[key], getattr(np, key)(every, axis=0))
+    assert found["count"] == [14] and pooled([each[0], {}]) == {}

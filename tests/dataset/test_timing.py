@@ -1,0 +1,154 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fake_dataset import LENGTHS, write_fake, writer
+
+from astra_data.core.errors import BadInputError
+from astra_data.dataset.columns import (
+    ACTION,
+    DONE,
+    NEXT_STATE,
+    REWARD,
+    STATE,
+    SUCCESS,
+    TERMINATED,
+    TRUNCATED,
+    Column,
+    Episode,
+)
+from astra_data.dataset.reader import Dataset
+from astra_data.dataset.timing import resample, trim
+
+TURNS = {"unit": ["m", "rad", "1", "1", "1", "1"], "role": ["invariant", "heading", *["quaternion"] * 4]}
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> Dataset:
+    return write_fake(tmp_path / "fake")
+
+
+def made(path: Path) -> list[Episode]:
+    return list(Dataset.open(path).episodes())
+
+
+def test_time_goes_from_both_ends_and_what_lost_its_end_is_truncated(source: Dataset, tmp_path: Path) -> None:
+    found = made(trim(source, start_s=0.1, end_s=0.2, out=tmp_path / "out"))  # 2 and 4 of 20 steps a second
+    before = {episode.uid: episode for episode in source.episodes()}
+    assert [len(one) for one in found] == [length - 6 for length in LENGTHS if length > 6]
+    for one in found:
+        whole = before[one.uid].columns
+        np.testing.assert_array_equal(one.columns[STATE], whole[STATE][2:-4])
+        assert one.columns[TRUNCATED].tolist() == one.columns[DONE].tolist() == [*[False] * (len(one) - 1), True]
+        assert not one.columns[TERMINATED].any() and one.metadata["success"] is False
+        assert one.metadata["return"] == pytest.approx(whole[REWARD][2:-4].sum(), rel=1e-5)
+
+
+def test_an_episode_that_loses_nothing_stays_as_it_is(source: Dataset, tmp_path: Path) -> None:
+    (whole,) = [episode for episode in source.episodes() if len(episode) == 30]
+    (found,) = [one for one in made(trim(source, without="mode == 0.5", out=tmp_path / "out")) if len(one) == 30]
+    assert found.uid == whole.uid and found.metadata == whole.metadata and not found.columns[TRUNCATED][:-1].any()
+
+
+def test_steps_of_a_condition_go_and_what_is_left_are_episodes(tmp_path: Path) -> None:
+    columns = [Column(STATE, size=2, names=("x", "v")), Column("charging", "bool"), Column(REWARD)]
+    with writer(tmp_path / "logs", columns=columns) as open_writer:
+        v = np.array([1, 0, 0, 2, 3, 0, 1], np.float32)
+        values = {STATE: np.stack([np.arange(7, dtype=np.float32), v], 1), REWARD: v, "charging": v == 3}
+        open_writer.add(Episode(5, values, {"return": 7.0}))
+    logs = Dataset.open(tmp_path / "logs")
+    found = made(trim(logs, without="v < 0.5", out=tmp_path / "moving"))
+    assert [one.columns[STATE][:, 0].tolist() for one in found] == [[0], [3, 4], [6]]
+    assert found[0].uid == 5 and len({one.uid for one in found}) == 3
+    assert [one.metadata.get("source_episode") for one in found] == [None, 5, 5]
+    assert [one.metadata["return"] for one in found] == [1.0, 5.0, 1.0]
+    again = made(trim(logs, without="v < 0.5", out=tmp_path / "again"))
+    assert [one.uid for one in again] == [one.uid for one in found]
+    for text, left in (("observation.state.v>=2", [3, 2]), ("charging == true", [4, 2])):
+        assert [len(one) for one in made(trim(logs, without=text, out=tmp_path / text[:4]))] == left
+
+
+def test_still_ends_go_and_pauses_stay(tmp_path: Path) -> None:
+    x = np.array([0, 0, 0, 1, 1, 2, 2, 2], np.float32)
+    with writer(tmp_path / "logs", columns=[Column(STATE), Column(NEXT_STATE)]) as open_writer:
+        open_writer.add(Episode(0, {STATE: x[:-1], NEXT_STATE: x[1:]}))
+        open_writer.add(Episode(1, {STATE: np.zeros(3, np.float32), NEXT_STATE: np.zeros(3, np.float32)}))
+    (found,) = made(trim(Dataset.open(tmp_path / "logs"), still=True, out=tmp_path / "out"))
+    assert found.columns[STATE].tolist() == [0, 1, 1] and found.columns[NEXT_STATE].tolist() == [1, 1, 2]
+
+
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [
+        ({}, "expected a time at the start or the end"),
+        ({"start_s": 99.0}, "nothing of its 5 episodes would be left"),
+        ({"without": "mode"}, "expected a condition such as 'v < 0.05'"),
+        ({"without": "x < near"}, "expected a condition such as 'v < 0.05'"),
+        ({"without": "mod < 3"}, "no value 'mod': did you mean 'mode'"),
+    ],
+)
+def test_what_cannot_be_trimmed_is_told_and_nothing_written(
+    source: Dataset, tmp_path: Path, asked: dict[str, float], message: str
+) -> None:
+    with pytest.raises(BadInputError, match=message):
+        trim(source, out=tmp_path / "out", **asked)  # type: ignore[arg-type]
+    assert not (tmp_path / "out").exists()
+
+
+def turning(folder: Path, fps: int, steps: int) -> Dataset:
+    """A robot that moves by 2 m/s and turns by 3 rad/s, recorded `fps` times a second, commands by their number."""
+    time_s = np.arange(steps + 1) / fps
+    yaw = 3 * time_s
+    quaternion = np.stack([np.cos(yaw / 2), 0 * yaw, 0 * yaw, np.sin(yaw / 2)], 1)
+    quaternion[::2] *= -1  # the same rotation
+    state = np.concatenate([2 * time_s[:, None], ((yaw + np.pi) % (2 * np.pi) - np.pi)[:, None], quaternion], 1)
+    last = np.arange(steps) == steps - 1
+    columns = [Column(STATE, size=6, astra=TURNS), Column(NEXT_STATE, size=6, astra=TURNS), Column(ACTION)]
+    columns += [Column(REWARD), Column(TERMINATED, "bool"), Column(SUCCESS, "bool"), Column("abstract.state")]
+    values = {STATE: state[:-1], NEXT_STATE: state[1:], ACTION: np.arange(steps), REWARD: np.ones(steps)}
+    values |= {"abstract.state": np.zeros(steps)}
+    flags = {TERMINATED: last, SUCCESS: last & False}
+    with writer(folder, columns=columns, fps=fps) as open_writer:
+        floats = {name: value.astype(np.float32) for name, value in values.items()}
+        open_writer.add(Episode(3, floats | flags, {"return": float(steps), "success": False}))
+    return Dataset.open(folder)
+
+
+@pytest.mark.parametrize(("fps", "steps"), [(10, 12), (25, 31), (100, 125)])
+def test_states_at_another_rate_are_where_the_robot_was(tmp_path: Path, fps: int, steps: int) -> None:
+    """Recorded for 1.25 s, 50 times a second."""
+    root = resample(turning(tmp_path / "logs", 50, 62), fps, out=tmp_path / "out")
+    found, (episode,) = Dataset.open(root), made(root)
+    assert found.info["fps"] == fps and len(episode) == int(62 / 50 * fps + 1e-6) and len(episode) in (steps, steps - 1)
+    time_s = np.arange(len(episode)) / fps
+    for name, at in ((STATE, time_s), (NEXT_STATE, time_s + 1 / fps)):
+        state = episode.columns[name]
+        np.testing.assert_allclose(state[:, 0], 2 * at, atol=1e-5)
+        apart = (state[:, 1] - 3 * at + np.pi) % (2 * np.pi) - np.pi
+        np.testing.assert_allclose(apart, 0, atol=1e-5)
+        assert np.abs(state[:, 1]).max() <= np.pi + 1e-5
+        w, z = state[:, 2], state[:, 5]
+        np.testing.assert_allclose((2 * np.arctan2(z, w) - 3 * at + np.pi) % (2 * np.pi) - np.pi, 0, atol=1e-3)
+        np.testing.assert_allclose(w**2 + z**2, 1, atol=1e-5)
+    np.testing.assert_array_equal(episode.columns[ACTION], np.floor(time_s * 50 + 1e-6))
+    assert episode.columns[REWARD].sum() == 62 and episode.metadata["return"] == 62
+    assert episode.columns[TERMINATED].tolist() == [*[False] * (len(episode) - 1), True]
+    assert "abstract.state" not in found.features
+
+
+def test_rewards_and_endings_are_those_of_all_steps_within(tmp_path: Path) -> None:
+    (episode,) = made(resample(turning(tmp_path / "logs", 50, 13), 10, out=tmp_path / "out"))
+    assert episode.columns[REWARD].tolist() == [5, 8]  # and of the three after the last whole one
+    assert episode.columns[ACTION].tolist() == [0, 5] and episode.uid == 3
+
+
+def test_without_next_states_the_last_state_has_no_step_after_it(tmp_path: Path) -> None:
+    with writer(tmp_path / "logs", columns=[Column(STATE)], fps=10) as open_writer:
+        open_writer.add(Episode(0, {STATE: np.arange(6, dtype=np.float32)}))
+    (episode,) = made(resample(Dataset.open(tmp_path / "logs"), 5, out=tmp_path / "out"))
+    assert episode.columns[STATE].tolist() == [0, 2, 4]
+
+
+def test_another_rate_is_one(source: Dataset, tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="expected another rate than 20 per second"):
+        resample(source, 20, out=tmp_path / "out")
