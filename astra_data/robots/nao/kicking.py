@@ -85,8 +85,8 @@ _FADES = 0.75  # share of the evidence of a hit that counts in the next step: a 
 class BallAgent(PlanarStates):
     """B point masses, each with a ball: [x, y, vx, vy, ball x, ball y, ball vx, ball vy], in m and m/s.
 
-    A command is the velocity of the next step and whether to stand and kick. Corrections move only balls that rolled or
-    were touched. Whether one that lay starts to roll is drawn once: none creeps, and no policy waits until a kick works.
+    A command is the velocity of the next step and whether to stand and kick. Corrections move only balls that rolled
+    or were touched. Whether one that lay starts to roll is drawn once: none creeps, and no policy waits for luck.
     """
 
     state_size = 8

@@ -313,7 +313,7 @@ def test_other_files_in_the_folder_are_left_out(tmp_path: Path) -> None:
     ],
 )
 def test_a_path_that_is_none_of_a_dataset_is_refused(path: str) -> None:
-    with pytest.raises(SharingError, match="expected one of a dataset's files, within data/ or meta/"):
+    with pytest.raises(SharingError, match="expected one of a dataset's files, within data/, meta/ or videos/"):
         parse_sums(f"{DIGEST}  meta/info.json\n{DIGEST}  {path}\n", "it")
 
 
