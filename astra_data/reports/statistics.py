@@ -122,24 +122,36 @@ def probability_of_improvement(scores: Floats, others: Floats) -> Estimate | Non
 
 def correlation(first: Sequence[Floats], second: Sequence[Floats], *, ranks: bool = False) -> Estimate | None:
     """Correlate two scores, (seeds,) for each row, by Pearson's or Spearman's coefficient, resampling both."""
-    from scipy.stats import rankdata
-
-    def coefficient(pair: Floats) -> float:
-        if np.ptp(pair, axis=1).min() == 0:
-            return math.nan
-        return float(np.corrcoef(rankdata(pair, axis=1) if ranks else pair)[0, 1])
+    pairs, rng = [np.stack(of) for of in zip(first, second, strict=True)], np.random.default_rng(0)
+    whole = np.concatenate(pairs, axis=1)
+    if whole.shape[1] < LEAST_SEEDS or math.isnan(value := float(_coefficients(whole[None], ranks)[0])):
+        return None
 
     def drawn() -> Floats:
         rows = [pairs[row] for row in rng.integers(len(pairs), size=len(pairs))]
         return np.concatenate([pair[:, rng.integers(pair.shape[1], size=pair.shape[1])] for pair in rows], axis=1)
 
-    pairs, rng = [np.stack(of) for of in zip(first, second, strict=True)], np.random.default_rng(0)
-    whole = np.concatenate(pairs, axis=1)
-    if whole.shape[1] < LEAST_SEEDS or math.isnan(value := coefficient(whole)):
-        return None
+    of_a_size: dict[int, list[Floats]] = {}
+    for _ in range(REPLICATES):
+        sample = drawn()
+        of_a_size.setdefault(sample.shape[1], []).append(sample)
+    found = [_coefficients(np.stack(samples), ranks) for samples in of_a_size.values()]
     tails = [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2]
-    low, high = np.nanquantile([coefficient(drawn()) for _ in range(REPLICATES)], tails)
+    low, high = np.nanquantile(np.concatenate(found), tails)
     return Estimate(value, float(low), float(high))
+
+
+def _coefficients(pairs: Floats, ranks: bool) -> Floats:
+    """Return the coefficient of each of `pairs` (M, 2, N), (M,); NaN where one of the two is constant."""
+    from scipy.stats import rankdata
+
+    values = np.asarray(rankdata(pairs, axis=2), dtype=np.float64) if ranks else pairs
+    apart = values - values.mean(axis=2, keepdims=True)
+    products = apart @ apart.transpose(0, 2, 1) * np.true_divide(1, pairs.shape[2] - 1)
+    deviation = np.sqrt(np.diagonal(products, axis1=1, axis2=2))
+    with np.errstate(invalid="ignore"):
+        found: Floats = products[:, 0, 1] / deviation[:, 0] / deviation[:, 1]
+    return np.where(np.ptp(pairs, axis=2).min(axis=1) == 0, math.nan, found.clip(-1, 1))
 
 
 @cache
