@@ -47,9 +47,9 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture
-def quick_failures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fit failure models in a few updates, where what they foresee does not matter."""
-    importlib.import_module("quick_runs").fit_failures_quickly(monkeypatch)
+def quick_fits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fit failure and scatter models in a few updates, where what they foresee does not matter."""
+    importlib.import_module("quick_runs").fit_quickly(monkeypatch)
 
 
 @pytest.fixture

@@ -50,6 +50,7 @@ def run_here(path: Path, until: str | None = None, device: str = "cpu") -> Path:
     return experiment.folder
 
 
-def fit_failures_quickly(patch: pytest.MonkeyPatch) -> None:
-    """Make failure models of a few updates, which foresee nothing."""
-    patch.setattr("astra_data.grounding.failures._DESCENT", DescentConfig(updates=3, learning_rate=1e-3))
+def fit_quickly(patch: pytest.MonkeyPatch) -> None:
+    """Fit failure and scatter models in a few updates: they foresee nothing."""
+    for model in ("failures", "scatter"):
+        patch.setattr(f"astra_data.grounding.{model}._DESCENT", DescentConfig(updates=3, learning_rate=1e-3))

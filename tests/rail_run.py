@@ -5,7 +5,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from quick_runs import fit_failures_quickly, run_here
+from quick_runs import fit_quickly, run_here
 from shared_runs import shared
 
 ROOT = Path(__file__).parents[1]
@@ -47,7 +47,7 @@ def make_rail_run(place: Path, *, seeds: str = "[0, 1, 2]", methods: str = "", m
     """Make such a run up to its policies; return its folder."""
     path = write_recipe(place, seeds=seeds, methods=methods, more=more)
     with pytest.MonkeyPatch.context() as patch:
-        fit_failures_quickly(patch)
+        fit_quickly(patch)
         return run_here(path, until="align")
 
 

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from quick_runs import fit_quickly
 from small_run import ALIGN, GROUND, TASK, TRAIN, short_task
 from typer.core import TyperGroup
 from typer.main import get_command
@@ -86,7 +87,8 @@ def quickstart(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = {"seed": 0, "device": "cpu", "progress": silent}
     run.mkdir(parents=True)
     (run / "recipe.json").write_text('{"task": "antmaze-umaze", "evaluate": {"episodes": 2}}')
-    with short_task():
+    with short_task(), pytest.MonkeyPatch.context() as patch:
+        fit_quickly(patch)
         collect(TASK, CollectConfig(episodes=100, max_steps=25), seed=0, out=collected, progress=silent)
         pair(TASK, PairConfig(), dataset=collected, out=pairs, progress=silent)
         few = GROUND.model_copy(update={"updates": 2})

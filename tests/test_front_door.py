@@ -75,6 +75,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made
 
 
+@pytest.mark.usefixtures("quick_fits")
 @pytest.mark.parametrize("name", [name for name in PUBLIC if not name.isupper() and name != "load_policy"])
 def test_examples_run(name: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for path in folder.iterdir():

@@ -47,7 +47,7 @@ def shortened(content: Notebook) -> Notebook:
     return content | {"cells": [cell(kept) for kept in content["cells"]]}
 
 
-@pytest.mark.usefixtures("quick_failures")
+@pytest.mark.usefixtures("quick_fits")
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: str(path.stem))
 def test_a_notebook_runs_and_shows_what_it_prints(path: Path) -> None:
     kept = read_notebook(path)

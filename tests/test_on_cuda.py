@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 from gpu import needs_cuda
-from quick_runs import fit_failures_quickly, run_here
+from quick_runs import fit_quickly, run_here
 
 from astra_data.policies.running_policy import PolicyFile
 
@@ -75,7 +75,7 @@ def make(place: Path, rows: tuple[str, ...], settings: str) -> Path:
     path = place / "small.toml"
     path.write_text(f'task = "antmaze-umaze"\nmethods = {json.dumps(rows)}\nseeds = [0]\n{settings}{REST}')
     with pytest.MonkeyPatch.context() as patch:
-        fit_failures_quickly(patch)
+        fit_quickly(patch)
         return run_here(path, "align", device="cuda")
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from quick_runs import fit_quickly
 from small_run import GROUND, TASK, TRAIN, short_task
 
 from astra_data.core.artifact import read_manifest
@@ -33,7 +34,8 @@ from astra_data.robots.registry import TASKS
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the folder of a run with a policy of NAS, which has the source encoder."""
     folder = tmp_path_factory.mktemp("runs") / "small"
-    with short_task():
+    with short_task(), pytest.MonkeyPatch.context() as patch:
+        fit_quickly(patch)
         config = CollectConfig(episodes=4, max_steps=20)
         walks = collect(TASK, config, seed=0, out=folder / "collect/seed_0", progress=silent)
         pairs = pair(TASK, PairConfig(), dataset=walks, out=folder / "pair/seed_0")

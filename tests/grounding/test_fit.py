@@ -8,7 +8,6 @@ from toy_episodes import toy_episodes
 
 from astra_data.core.progress import silent
 from astra_data.grounding import fit as fit_module
-from astra_data.grounding.descent import DescentConfig
 from astra_data.grounding.fit import Fitting, GroundConfig, HistoryFit, recorded_clearance_m, with_own_rewards
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.model import GroundingModel, GroundingShape, LossWeights
@@ -47,12 +46,8 @@ def test_residual_rewards_are_what_abstract_states_do_not_explain() -> None:
     assert residual.failed[0].tolist() == [0.0, 0.0, 1.0, 0.0, 0.0]
 
 
+pytestmark = pytest.mark.usefixtures("quick_fits")
 TASK = TASKS["antmaze-umaze"]
-
-
-@pytest.fixture(autouse=True)
-def _quick(monkeypatch: pytest.MonkeyPatch, quick_failures: None) -> None:
-    monkeypatch.setattr("astra_data.grounding.scatter._DESCENT", DescentConfig(updates=3, learning_rate=1e-3))
 
 
 def episodes(seed: int, count: int = 4, failing: int = 1) -> PairedEpisodes:

@@ -154,6 +154,7 @@ def test_causal_compass_finds_the_parameters_that_were_planted(tmp_path: Path) -
     assert grounding.variation.position_noise_m == (0.0, 2e-3)  # noise is not identified
 
 
+@pytest.mark.usefixtures("quick_fits")
 def test_they_are_rows_from_the_recipe_to_the_page(tmp_path: Path) -> None:
     own = "".join(f'{name} = "{EXAMPLES}/{name}.py:METHOD"\n' for name in ("delta_action", "nas_golemo", "sb3_ppo"))
     rows = '["direct_transfer", "delta_action", "nas_golemo", "sb3_ppo"]'

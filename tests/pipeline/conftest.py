@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from quick_runs import fit_failures_quickly, run_here, small_tables
+from quick_runs import fit_quickly, run_here, small_tables
 from shared_runs import shared
 from small_run import ALIGN, COLLECT, GROUND, TASK, TRAIN, short_task
 
@@ -30,7 +30,8 @@ def task() -> Iterator[str]:
 def make(folder: Path) -> None:
     """Make ASTRA's artifacts of seed 0, and a policy of each of two rows."""
     pairs, grounding = folder / "pair/seed_0", folder / "ground/astra/seed_0"
-    with short_task():
+    with short_task(), pytest.MonkeyPatch.context() as patch:
+        fit_quickly(patch)
         walks = collect(TASK, COLLECT, seed=0, out=folder / "collect/seed_0")
         pair(TASK, dataset=walks, out=pairs)
         ground(TASK, "astra", GROUND, dataset=pairs, out=grounding)
@@ -93,7 +94,7 @@ def make_cart(folder: Path) -> None:
     tables = small_tables(held_out_share=0.25, episodes=3, train="data_start_share = 0.0")
     (folder / "cart.toml").write_text(rows + tables)
     with pytest.MonkeyPatch.context() as patch:
-        fit_failures_quickly(patch)
+        fit_quickly(patch)
         run_here(folder / "cart.toml", until="align")
 
 

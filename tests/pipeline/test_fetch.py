@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from quick_runs import run_here, small_tables
+from quick_runs import fit_quickly, run_here, small_tables
 
 from astra_data.reports.artifacts import EVALUATION, Evaluation, read_json
 from astra_data.robots.registry import task_named
@@ -32,7 +32,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for file in FETCH.glob("*.py"):
         shutil.copy(file, made)
     (made / "reach.toml").write_text(SMALL + small_tables(held_out_share=0.34, episodes=2))
-    return run_here(made / "reach.toml", until="evaluate")
+    with pytest.MonkeyPatch.context() as patch:
+        fit_quickly(patch)
+        return run_here(made / "reach.toml", until="evaluate")
 
 
 def test_the_recipe_runs_until_a_policy_is_tested_in_the_arm(folder: Path) -> None:

@@ -23,7 +23,7 @@ from astra_data.pipeline.stages.label import label
 from astra_data.pipeline.trained_policy import load_policy
 from astra_data.reports.artifacts import EVALUATION, Evaluation, read_json
 
-pytestmark = pytest.mark.usefixtures("quick_failures")
+pytestmark = pytest.mark.usefixtures("quick_fits")
 CART = Path(__file__).parents[2] / "recipes/examples/cart"
 SMALL = small_tables(held_out_share=0.25, episodes=3)
 
@@ -58,7 +58,7 @@ def test_logs_become_policies_and_a_page_without_a_target(cart: Path) -> None:
     assert "in which only NAS trained" in page[2]
     text = "\n".join(page[3:])
     assert "over seeds, in the simulator grounded by NAS" in text and "n the target." not in text
-    assert not re.search(r"wall contact|maze|path length to success", text) and "Correlation with" not in text
+    assert not re.search(r"wall contact|maze", text) and "Correlation with" not in text
     results = json.loads((folder / "report/results.json").read_text())
     assert results["tested_in"] == "simulators" and results["rows"] == ["direct_transfer", "nas", "astra"]
     assert [dataset["stage"] for dataset in results["datasets"]] == ["label", "pair", "evaluate"]

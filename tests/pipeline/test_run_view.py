@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import torch
 from command_line import call
+from quick_runs import fit_quickly
 from recordings_of_rerun import read, scalars
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import silent
 from astra_data.dataset.reader import Dataset
-from astra_data.grounding.descent import DescentConfig
 from astra_data.grounding.files import load_grounding
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.model import GroundingModel
@@ -51,7 +51,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "cart.toml").write_text(RECIPE)
     experiment = load_experiment(folder / "cart.toml", folder / "runs")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("astra_data.grounding.failures._DESCENT", DescentConfig(updates=10, learning_rate=3e-3))
+        fit_quickly(patch)
         for item in plan(experiment.recipe, experiment.path, experiment.folder):
             if item.stage in ("collect", "pair", "ground") and item.key.endswith("seed_3"):
                 item.call(progress=silent)

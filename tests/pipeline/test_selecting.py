@@ -13,7 +13,7 @@ from astra_data.core.errors import BadInputError
 from astra_data.methods import grounded_as
 from astra_data.pipeline.selecting import select
 
-pytestmark = pytest.mark.usefixtures("quick_failures")
+pytestmark = pytest.mark.usefixtures("quick_fits")
 
 
 @pytest.fixture(scope="module")

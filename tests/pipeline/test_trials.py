@@ -20,7 +20,7 @@ from astra_data.pipeline.trained_policy import TrainedPolicy, trained_policy
 from astra_data.policies.running_policy import RunningPolicy
 from astra_data.reports.choice import TrialsFile, halve
 
-pytestmark = pytest.mark.usefixtures("quick_failures")
+pytestmark = pytest.mark.usefixtures("quick_fits")
 
 
 @pytest.fixture(scope="module")

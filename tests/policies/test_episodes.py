@@ -168,7 +168,7 @@ def policy(folder: Path, judge: FittedGrounding) -> RunningPolicy:
     return running(CART, PolicyFile.load(folder / "train/nas/seed_0/policy.safetensors"), judge)
 
 
-@pytest.mark.usefixtures("quick_failures")
+@pytest.mark.usefixtures("quick_fits")
 def test_failures_are_drawn_in_the_whole_simulator_of_the_grounding(
     judge: FittedGrounding, policy: RunningPolicy, monkeypatch: pytest.MonkeyPatch
 ) -> None:

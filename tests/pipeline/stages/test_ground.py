@@ -16,6 +16,8 @@ from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.methods import add_method
 from astra_data.pipeline.stages.ground import ground
 
+pytestmark = pytest.mark.usefixtures("quick_fits")
+
 
 def test_of_a_reward_that_abstract_states_tell_whole_nothing_is_left_to_correct(
     task: str, paired: Path, tmp_path: Path

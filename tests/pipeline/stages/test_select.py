@@ -15,7 +15,7 @@ from astra_data.policies.episodes import judged_success
 from astra_data.reports.choice import Judged, read_judged
 from astra_data.reports.runs import Reported
 
-pytestmark = pytest.mark.usefixtures("quick_failures")
+pytestmark = pytest.mark.usefixtures("quick_fits")
 
 ROWS, SEEDS = ("direct_transfer", "nas"), (0, 1, 2)
 

@@ -282,7 +282,7 @@ held_out_share = 0.25
 """
 
 
-@pytest.mark.usefixtures("quick_failures")
+@pytest.mark.usefixtures("quick_fits")
 def test_a_simulator_without_goals_is_grounded(tmp_path: Path) -> None:
     (tmp_path / "toy.toml").write_text(RECIPE)
     folder = run_here(tmp_path / "toy.toml", until="ground")
