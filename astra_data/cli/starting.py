@@ -49,8 +49,6 @@ def new(
             f"after {JUDGED_STEPS} steps it predicts {' and '.join(worse)} of the logs worse than standing "
             f"still would: edit `step` in {folder}/{name}.py"
         )
-    if not found.of("time"):
-        typer.echo(f"found no time field, so assumed {found.rate} rows per second: set fps and TIMESTEP_S")
     for line in (found.uneven, found.still):
         if line:
             typer.echo(f"{line} (CHECK)")

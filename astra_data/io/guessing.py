@@ -9,8 +9,6 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import pyarrow as pa
-from pyarrow import csv
 
 from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError
@@ -18,7 +16,7 @@ from astra_data.dataset.checkup import ANGLE, LARGEST, is_angle
 from astra_data.dataset.columns import ACTION, GOAL, STATE, SUCCESS, TERMINATED, TIMESTAMP
 from astra_data.dataset.reader import Dataset, refuse_run, refuse_versions
 from astra_data.io.cutting import RATE_TOLERANCE
-from astra_data.io.importers.csv import SUFFIXES, delimiter_of, explained, line_of, whole_lines
+from astra_data.io.importers.csv import SUFFIXES, is_number, numbers_of, texts_of
 from astra_data.io.recording import Source, foreign, refuse_dataset
 
 Role = Literal["time", "episode", "state", "command", "goal", "failure", "success", "reward", "left out"]
@@ -42,7 +40,7 @@ COMMAND, TORQUE, FORCE = (
     re.compile(rf"{words}(_.+|\d+)?")
     for words in (rf"((.+_)?({COMMANDED})|u)", "(.+_)?(tau|torque|effort|moment)", "(.+_)?(force|thrust)")
 )
-PEDAL = re.compile(r"throttle|brake|steer(ing)?(_angle)?")
+ACTING = (TORQUE, FORCE, re.compile(r"throttle|brake|steer(ing)?(_angle)?"))
 NO_PLACE = f"{TURNED}|quat|orient|vel|twist|linear|angular|speed|acc|rate|force|torque|moment"
 PLACE = re.compile(rf"(?!.*({NO_PLACE}))(.+_)?(p|pos)?(?P<axis>[xyz]|east(ing)?|north(ing)?|up|alt(itude)?|depth)")
 GPS = re.compile(r"(?P<stem>(.+_)?)(?P<axis>lat|lon|lng)(itude|gitude)?")
@@ -67,15 +65,10 @@ _UNITS = {
 UNITS = {end: (unit, float(scale)) for unit, ends in _UNITS.items() for end, scale in batched(ends.split(), 2)}
 """Endings of names, the unit that values are stored in, and the factor to it."""
 TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-MOST_END_ROWS = 10
-"""Rows at the end of a log for which a flag that ends it may be set."""
-RATE_HZ = 10.0
-"""Assumed rate of logs without a time."""
-MOSTLY = 0.9
-"""Share of a field's rows with a number above which the others are faults."""
-_EVEN = 0.005
-"""Relative error of a rate that counts as a whole number."""
-_NUMBER = re.compile(r"\s*[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?\s*|[+-]?(nan|inf)", re.IGNORECASE)
+MOST_END_ROWS = 10  # rows at the end of a log for which a flag that ends it may be set
+RATE_HZ = 10.0  # assumed rate of logs without a time
+MOSTLY = 0.9  # share of a field's rows with a number above which the others are faults
+_EVEN = 0.005  # relative error of a rate that counts as a whole number
 
 
 @dataclass(frozen=True)
@@ -93,7 +86,7 @@ class Field:
     @property
     def plain(self) -> str:
         """`short` in small letters, digits and single underscores, as patterns of names expect it."""
-        return re.sub(r"[\W_]+", "_", self.short.lower()).strip("_") or self.short
+        return plain_name(self.short) or self.short
 
     @property
     def taken_for(self) -> str:
@@ -124,10 +117,8 @@ class Logs:
     @property
     def recorded_rate(self) -> float:
         """Rows per second without gaps and repeated rows; `RATE_HZ` where the logs have no time."""
-        for field in self.of("time"):
-            steps = _steps(self.episodes, field)
-            return 1 / float(steps[(steps > 0) & (steps <= 5 * np.median(steps))].mean())
-        return RATE_HZ
+        steps = np.concatenate([_steps(self.episodes, field) for field in self.of("time")] or [np.array([1 / RATE_HZ])])
+        return 1 / float(steps[(steps > 0) & (steps <= 5 * np.median(steps))].mean())
 
     @property
     def rate(self) -> int:
@@ -136,19 +127,21 @@ class Logs:
 
     @property
     def uneven(self) -> str:
-        """Why the rate is no whole number, and what to do; empty where it is one within `_EVEN`."""
-        if abs(error := self.recorded_rate / self.rate - 1) < _EVEN:
-            return ""
-        return (
+        """Why the rate is not known to be whole, and what to do; empty where it is one within `_EVEN`."""
+        if not self.of("time"):
+            return f"the logs have no time field, so {self.rate} rows per second are assumed: set fps and TIMESTEP_S"
+        error = self.recorded_rate / self.rate - 1
+        told = (
             f"the logs have {self.recorded_rate:.4g} rows per second, not a whole number: TIMESTEP_S is "
             f"{abs(error):.1%} too {'long' if error > 0 else 'short'}; resample them to {self.rate} rows per second"
         )
+        return told if abs(error) >= _EVEN else ""
 
     @property
     def still(self) -> str:
         """Which commands never change, and the consequence; empty where all do."""
-        given = np.concatenate(self.values(self.of("command")))
-        named = [f"{f.short} is {v[0]:g}" for f, v in zip(self.of("command"), given.T, strict=True) if not np.ptp(v)]
+        given = np.concatenate(self.values(self.of("command"))).T
+        named = [f"{one.short} is {v[0]:g}" for one, v in zip(self.of("command"), given, strict=True) if not np.ptp(v)]
         what = "it does" if len(named) == 1 else "they do"
         return f"{' and '.join(named)} in all rows: no simulator can learn what {what}" if named else ""
 
@@ -157,36 +150,39 @@ def guess(paths: Sequence[Path]) -> Logs:
     """Read CSV logs, files with the same fields or folders of them, and guess what their fields are."""
     sources = [Source(file, None, file) for path in paths for file in csv_files(path)]
     tables, torn = zip(*map(read_numbers, sources), strict=True)
-    filled = [[name for name, values in table.items() if np.isfinite(values).any()] for table in tables]
-    first = sources[0].path
-    for source, names, table in zip(sources, filled, tables, strict=True):
-        if {*names, *filled[0]} - (table.keys() & tables[0].keys()):
-            raise BadInputError(f"{source.path}: expected the fields of {first}, {filled[0]}: got {names}")
+    first, names = (
+        sources[0].path,
+        [{name for name, values in one.items() if np.isfinite(values).any()} for one in tables],
+    )
+    for source, table, filled in zip(sources, tables, names, strict=True):
+        if {*filled, *names[0]} - (table.keys() & tables[0].keys()):
+            fields_of = [[name for name in tables[0] if name in names[0]], [name for name in table if name in filled]]
+            raise BadInputError(f"{source.path}: expected the fields of {first}, {fields_of[0]}: got {fields_of[1]}")
     raw = [episode for table in tables for episode in _episodes(table)]
     fields: list[Field] = []
     for name in (name for name in tables[0] if all(name in table for table in tables)):
         found = _field(name, [episode[name] for episode in raw])
-        taken = [other.taken_for for other in fields if other.role in ("state", "command")]
-        fields.append(replace(found, short=plain_name(name)) if found.taken_for in taken else found)
+        is_taken = found.role in ("state", "command") and found.taken_for in [one.taken_for for one in fields]
+        fields.append(replace(found, short=plain_name(name)) if is_taken else found)
     fields = _places(_roles(_times(fields, raw)), raw)
+    for role, example in (("command", "cmd_v"), ("state", "x")):
+        if role not in [field.role for field in fields]:
+            listed = ", ".join(f"{field.name} ({field.role})" for field in fields)
+            raise BadInputError(f"{first}: found no {role} among {listed}: name one in the header, such as {example}")
     needed = [field.name for field in fields if field.role in ("time", "state", "command")]
     gaps = {name: gap for name in needed if (gap := sum(int((~np.isfinite(one[name])).sum()) for one in raw))}
     rows = [np.isfinite([one[name] for name in needed]).all(axis=0) for one in raw]
+    if all(kept.sum() < 2 for kept in rows):
+        cut = [field.name for field in fields if field.role == "episode" or field.name in gaps]
+        why = f"look at {' and '.join(cut)}, which cut or lack rows" if cut else "record longer"
+        raise BadInputError(f"{first}: expected episodes of two rows or more, found none: {why}")
     scaled = [
         {field.name: (one[field.name] * field.scale + field.offset)[kept] for field in fields}
         for one, kept in zip(raw, rows, strict=True)
         if kept.any()
     ]
-    cut_off = tuple(str(source.path) for source, is_torn in zip(sources, torn, strict=True) if is_torn)
-    logs = Logs(tuple(fields), tuple(scaled), gaps, cut_off)
-    for role, example in (("command", "cmd_v"), ("state", "x")):
-        if role not in [field.role for field in fields]:
-            listed = ", ".join(f"{field.name} ({field.role})" for field in fields)
-            raise BadInputError(f"{first}: found no {role} among {listed}: name one in the header, such as {example}")
-    if all(kept.sum() < 2 for kept in rows):
-        cut = [field.name for field in fields if field.role == "episode" or field.name in gaps]
-        why = f"look at {' and '.join(cut)}, which cut or lack rows" if cut else "record longer"
-        raise BadInputError(f"{first}: expected episodes of two rows or more, found none: {why}")
+    cut_off = [str(source.path) for source, is_torn in zip(sources, torn, strict=True) if is_torn]
+    logs = Logs(tuple(fields), tuple(scaled), gaps, tuple(cut_off))
     if abs(logs.recorded_rate / logs.rate - 1) > RATE_TOLERANCE:
         raise BadInputError(
             f"{first}: {logs.of('time')[0].name}: expected rows per second within {RATE_TOLERANCE:.0%} "
@@ -220,6 +216,7 @@ def _field(name: str, series: Sequence[Floats]) -> Field:
     is_goal = goal and (goal["axis"] or not is_flag) and not any(map(np.ptp, series))
     rises = (STAMP.fullmatch(clock) or time_unit) and (steps >= 0).all() and (steps > 0).any()
     named, lacking = "its name", len(values) - len(finite)
+    ended = f"all {len(flags)} of {len(series)} episodes that have a 1"
     roles: list[tuple[object, Role, str]] = [
         (not plain, "left out", "no letter a to z"),
         (not finite.size, "left out", "texts, dates or nothing: expected numbers, of a time in s, ms, us or ns"),
@@ -233,11 +230,7 @@ def _field(name: str, series: Sequence[Floats]) -> Field:
         (is_goal, "goal", ""),
         (not np.ptp(finite) if finite.size else True, "left out", "never changes"),
         (COMMAND.fullmatch(body), "command", ""),
-        (
-            is_flag and ends,
-            "failure",
-            f"0 or 1, and it ends all {len(flags)} of {len(series)} episodes that have a 1 (CHECK)",
-        ),
+        (is_flag and ends, "failure", f"0 or 1, and it ends {ended} (CHECK)"),
         (is_flag, "left out", "0 or 1: name it success or failed if it is an end"),
         (lacking >= (1 - MOSTLY) * len(values), "left out", f"no number in {lacking} rows"),
     ]
@@ -251,42 +244,40 @@ def _field(name: str, series: Sequence[Floats]) -> Field:
     short = f"{'u' if role == 'command' else 's'}{short}" if short[0].isdigit() else short
     if ending is not None:
         return Field(name, role, short, *UNITS[ending], "its ending")
-    unit, scale = "1", 1.0
+    unit, largest, is_state = "1", np.abs(finite).max(), role != "command"
     if TORQUE.fullmatch(short) or FORCE.fullmatch(short):
         unit = "N m" if TORQUE.fullmatch(short) else "N"
-    elif role != "command" and (ANGLE.fullmatch(short) or HEADING.fullmatch(short)):
-        unit, largest = "rad", np.abs(finite).max()
-        scale, named = (_DEGREE, f"an angle up to {largest:.0f}: degrees") if largest > LARGEST else (scale, named)
-    elif role != "command" and PLACE.fullmatch(short):
+    elif is_state and (ANGLE.fullmatch(short) or HEADING.fullmatch(short)):
+        if largest > LARGEST:
+            return Field(name, role, short, "rad", _DEGREE, f"an angle up to {largest:.0f}: degrees")
+        unit = "rad"
+    elif is_state and PLACE.fullmatch(short):
         unit = "m"
-    return Field(name, role, short, unit, scale, named if unit != "1" else "no unit in its name")
+    return Field(name, role, short, unit, why=named if unit != "1" else "no unit in its name")
 
 
 def _times(fields: Sequence[Field], episodes: Sequence[dict[str, Floats]]) -> list[Field]:
     """Return the fields with one time, that of the log: the others are times of topics."""
-
-    def rank(field: Field) -> tuple[bool, bool]:
-        rises = bool((_steps(episodes, field) > 0).mean() > MOSTLY)
-        return not rises, not TIME.fullmatch(_without_unit(field.short, TIMES)[0])
-
-    times = sorted((field for field in fields if field.role == "time"), key=rank)
-    chosen = [field for field in times[:1] if not rank(field)[0]]
+    rising = [f for f in fields if f.role == "time" and (_steps(episodes, f) > 0).mean() > MOSTLY]
+    chosen = sorted(rising, key=lambda field: not TIME.fullmatch(_without_unit(field.short, TIMES)[0]))[:1]
     why = f"a time beside {chosen[0].name}" if chosen else "a time that stands still in some rows"
-    return [Field(f.name, "left out", f.short, why=why) if f in times and f not in chosen else f for f in fields]
+    topics = [field for field in fields if field.role == "time" and field not in chosen]
+    return [Field(field.name, "left out", field.short, why=why) if field in topics else field for field in fields]
 
 
 def _roles(fields: Sequence[Field]) -> list[Field]:
     """Return the fields, with forces and pedals as commands if there are no others, one of each outcome."""
-    is_commanded = any(field.role == "command" for field in fields)
-    found: dict[str, Field] = {}
+    is_commanded, found = any(field.role == "command" for field in fields), {field.name: field for field in fields}
+    seen: set[Role] = set()
     for field in sorted(fields, key=lambda field: field.why.endswith("(CHECK)")):
-        acts = any(pattern.fullmatch(field.short) for pattern in (TORQUE, FORCE, PEDAL))
-        if field.role in ("failure", "success", "reward") and field.role in [one.role for one in found.values()]:
-            field = replace(field, role="left out", why=f"a second {field.role}: combine both into one field")
-        elif field.role == "state" and acts and not is_commanded:
-            field = replace(field, role="command", why=f"{field.why}, and no other command")
-        found[field.name] = field
-    return [found[field.name] for field in fields]
+        if field.role in seen & {"failure", "success", "reward"}:
+            found[field.name] = replace(
+                field, role="left out", why=f"a second {field.role}: combine both into one field"
+            )
+        elif field.role == "state" and not is_commanded and any(one.fullmatch(field.short) for one in ACTING):
+            found[field.name] = replace(field, role="command", why=f"{field.why}, and no other command")
+        seen.add(field.role)
+    return [*found.values()]
 
 
 def _places(fields: Sequence[Field], episodes: Sequence[dict[str, Floats]]) -> list[Field]:
@@ -295,28 +286,28 @@ def _places(fields: Sequence[Field], episodes: Sequence[dict[str, Floats]]) -> l
     latitudes = {found["stem"]: name for name, found in gps.items() if found["axis"] == "lat"}
     pairs = {found["stem"] for found in gps.values() if found["axis"] != "lat"} & latitudes.keys()
     offsets: dict[str, float] = {}
-    placed: dict[str, Field] = {}
+    placed = {field.name: field for field in fields}
     for field in sorted(fields, key=lambda field: field.role == "goal"):  # goals take the offsets of states
         if field.role not in ("state", "goal"):
             continue
-        values = np.concatenate([episode[field.name] for episode in episodes])
+        values = np.concatenate([episode[field.name] for episode in episodes]) * field.scale
         first, largest = float(values[np.isfinite(values)][0]), float(np.nanmax(np.abs(values)))
         place, at = PLACE.fullmatch(field.short), gps.get(field.name)
         if at and at["stem"] in pairs:
-            degrees = 1e-7 if largest > 360 else 1.0
-            north = math.radians(float(np.nanmean(episodes[0][latitudes[at["stem"]]])) * degrees)
-            scale = degrees * METERS_PER_DEGREE * (1.0 if at["axis"] == "lat" else math.cos(north))
+            scale = METERS_PER_DEGREE * (degrees := 1e-7 if largest > 360 else 1.0)
+            if at["axis"] != "lat":
+                scale *= math.cos(math.radians(float(np.nanmean(episodes[0][latitudes[at["stem"]]])) * degrees))
             why, offset = "degrees, to m from the first row", offsets.setdefault(at["axis"], -first * scale)
             placed[field.name] = replace(field, unit="m", scale=scale, offset=offset, why=why)
         elif place and field.unit == "m":
             steps = np.abs(_steps(episodes, field)) * field.scale
             step = float(np.median(steps[steps > 0])) if (steps > 0).any() else math.inf
-            if field.role == "state" and np.spacing(np.float32(largest * field.scale)) > step / 100:
-                offsets[place["axis"]] = -float(round(first * field.scale))
+            if field.role == "state" and np.spacing(np.float32(largest)) > step / 100:
+                offsets[place["axis"]] = -float(round(first))
             if offset := offsets.get(place["axis"], 0.0):
                 why = f"{field.why}; an offset, as float32 cannot hold its steps"
                 placed[field.name] = replace(field, offset=offset, why=why)
-    return [placed.get(field.name, field) for field in fields]
+    return [*placed.values()]
 
 
 def _steps(episodes: Sequence[dict[str, Floats]], field: Field) -> Floats:
@@ -329,27 +320,24 @@ def _is_whole(values: Floats) -> bool:
 
 
 def _without_unit(name: str, endings: Iterable[str]) -> tuple[str, str | None]:
-    found = [ending for ending in endings if re.fullmatch(f".+_{ending}", name)]
-    ending = max(found, key=len, default=None)
-    return (name.removesuffix(f"_{ending}"), ending) if ending else (name, None)
+    found = re.fullmatch(rf"(.+?)_({'|'.join(endings)})", name)
+    return (found[1], found[2]) if found else (name, None)
 
 
 def csv_files(place: Path) -> list[Path]:
     """Return the CSV files in a folder, or the one that `place` is; raise BadInputError if there is none."""
-    if not place.exists():
-        raise BadInputError(f"{place}: no such file, folder or dataset")
     inside = sorted(place.iterdir()) if place.is_dir() else [place]
-    if found := [path for path in inside if path.suffix.lower() in SUFFIXES]:
-        return found
-    refuse_versions(place)
-    refuse_dataset(place)
-    refuse_run(place)
-    hint = foreign([str(path) for path in inside])
-    raise BadInputError(
-        f"{place}: {hint}{'; ' if hint else ''}expected files that end in {' or '.join(SUFFIXES)}, or a dataset: "
-        "make one of other recordings with `astra-data import LOGS --mapping FILE` (`astra-data recipes list` shows "
-        "mappings, such as ros2_base), then name it: --from NAME"
-    )
+    found = [path for path in inside if path.suffix.lower() in SUFFIXES]
+    if not found:
+        for refuse in (refuse_versions, refuse_dataset, refuse_run):
+            refuse(place)
+        hint = foreign([str(path) for path in inside])
+        raise BadInputError(
+            f"{place}: {hint}{'; ' if hint else ''}expected files that end in {' or '.join(SUFFIXES)}, or a dataset: "
+            "make one of other recordings with `astra-data import LOGS --mapping FILE` (`astra-data recipes list` "
+            "shows mappings, such as ros2_base), then name it: --from NAME"
+        )
+    return found
 
 
 def plain_name(name: str) -> str:
@@ -363,69 +351,54 @@ def read_numbers(source: Source) -> tuple[dict[str, Floats], bool]:
 
     Texts that name episodes become a number each; other texts and dates are NaN.
     """
-    file = str(source.path)
-    with explained(file, source):
-        content, is_torn = whole_lines(source, file)
-        options = csv.ParseOptions(delimiter=delimiter_of(file))
-        table = csv.read_csv(pa.BufferReader(content), parse_options=options)
-    if len(table) < 2:
-        raise BadInputError(f"{file}: expected two rows or more below its header, got {len(table)}: leave it out")
+    columns, is_torn, _ = texts_of(source)
     numbers: dict[str, Floats] = {}
-    for name, values in zip(table.column_names, table.columns, strict=True):
-        series: Floats = np.full(len(table), np.nan)
-        if pa.types.is_string(values.type):
-            texts = [text if text and text.strip() else "nan" for text in values.to_pylist()]
-            parsed = [float(text) if _NUMBER.fullmatch(text) else None for text in texts]
-            wrong = [row for row, number in enumerate(parsed) if number is None]
-            if wrong and len(wrong) < (1 - MOSTLY) * len(texts):
-                where = f"{file} line {line_of(source, wrong[0])}: {name}"
-                raise BadInputError(f"{where}: expected a number, got {texts[wrong[0]]!r}")
-            if not wrong:
-                series = np.array(parsed, float)
-            elif EPISODE.fullmatch(plain_name(name)) and not values.null_count:
-                series = np.unique(values.to_numpy(), return_inverse=True)[1].astype(float)
-        elif not pa.types.is_temporal(values.type):
-            series = np.asarray(values.cast(pa.float64(), safe=False).to_numpy())
-        if np.isfinite(series).any() and np.isfinite(numbers.get(name, np.nan)).any():
-            raise BadInputError(f"{file}: expected a header of different names, got {name} twice")
-        numbers[name] = series
+    for name, cells in columns.items():
+        if len(cells) < 2:
+            raise BadInputError(f"{source}: expected two rows or more below its header, got {len(cells)}: leave it out")
+        texts = cells.to_pylist()
+        words = sum(bool(text and not is_number(text)) for text in texts)
+        values = numbers_of(cells, source, name) if words < (1 - MOSTLY) * len(texts) else np.empty(0)
+        if len(values) and values.ndim == 1:
+            numbers[name] = values.astype(float)
+        elif EPISODE.fullmatch(plain_name(name)) and not cells.null_count:
+            numbers[name] = np.unique(texts, return_inverse=True)[1].astype(float)
+        else:
+            numbers[name] = np.full(len(texts), np.nan)
     if not any(np.isfinite(values).any() for values in numbers.values()):
-        raise BadInputError(f"{file}: expected rows of numbers below a header")
+        raise BadInputError(f"{source}: expected rows of numbers below a header")
     return numbers, is_torn
 
 
 def logs_of(data: Dataset) -> Logs:
     """Return the episodes of `data` as logs: its states, commands and goals by their own names, and failures."""
     columns = data.specs([STATE, ACTION, *([GOAL] if GOAL in data.features else [])])
+    fields: list[Field] = []
     roles: tuple[Role, ...] = ("state", "command", "goal")
-    fields = [
-        Field(f"{column.name} {name}", role, name, unit or "1", why="its column")
-        for column, role in zip(columns, roles, strict=False)
-        for name, unit in zip(
-            column.names or [f"{role[0]}{at}" for at in range(column.size)], column.units, strict=True
-        )
-    ]
-    ends = [name for name in (TERMINATED, SUCCESS) if name in data.features]
+    for column, role in zip(columns, roles[: len(columns)], strict=True):
+        names = column.names or [f"{role[0]}{at}" for at in range(column.size)]
+        for name, unit in zip(names, column.units, strict=True):
+            fields.append(Field(f"{column.name} {name}", role, name, unit or "1", why="its column"))
     episodes = []
+    ends = [name for name in (TERMINATED, SUCCESS) if name in data.features]
     for episode in data.episodes([*(column.name for column in columns), *ends]):
         values = np.column_stack([episode.columns[column.name] for column in columns]).astype(float)
         found = {field.name: series for field, series in zip(fields, values.T, strict=True)}
-        found[TIMESTAMP] = np.arange(len(values)) / data.info["fps"]
         success = episode.columns.get(SUCCESS, np.zeros(len(values), bool))
         found["failed"] = (episode.columns.get(TERMINATED, success) & ~success).astype(float)
-        episodes.append(found)
+        episodes.append(found | {TIMESTAMP: np.arange(len(values)) / data.info["fps"]})
     headings = [field for field in fields if field.role != "command" and HEADING.fullmatch(field.plain)]
     wrong = [one for one in fields if headings and (one in headings or one.role == "command") and "deg" in one.unit]
     for number, field in enumerate(fields):
-        largest = max(float(np.abs(values[field.name]).max()) for values in episodes)
         if field.role == "state" and field.unit == "1" and is_angle(field.short):
-            wrong += [field] if largest > LARGEST and field in headings else []
-            fields[number] = replace(field, unit="rad" if largest <= LARGEST else "1")
+            is_small = max(float(np.abs(values[field.name]).max()) for values in episodes) <= LARGEST
+            wrong += [field] if field in headings and not is_small else []
+            fields[number] = replace(field, unit="rad" if is_small else "1")
     if wrong:
-        named = ", ".join(f"{field.name} in {field.unit}" for field in wrong)
         raise BadInputError(
-            f"{data.reference} has {named}: expected rad and rad/s, as a dataset's values are taken as they are: "
-            "import the logs again with a `scale` of 0.0174533 there (or with the `unit` rad if so)"
+            f"{data.reference} has {', '.join(f'{field.name} in {field.unit}' for field in wrong)}: expected rad and "
+            "rad/s, as a dataset's values are taken as they are: import the logs again with a `scale` of 0.0174533 "
+            "there (or with the `unit` rad if so)"
         )
     failures = sum(bool(one["failed"].any()) for one in episodes)
     why = f"terminated, and no success: {failures} of {len(episodes)} episodes"

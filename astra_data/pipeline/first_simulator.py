@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.resources import files
+from itertools import islice, product
 from string import Template
 from typing import Any
 
@@ -32,10 +33,15 @@ TURN = re.compile(rf"{TURN_RATE.pattern}|.*(turn|yaw|ang|(?<!th)rot|steer|rudder
 STEERING = re.compile(r"(.+_)?steer(ing)?(_?(angle|ang))?")
 SIDE = re.compile(r"(left|port|(?<![a-z])[vw]?l(?![a-z]))|right|starboard|(?<![a-z])[vw]?r(?![a-z])")
 AHEAD = re.compile(r"v|(.+_)?(speed|vel(ocity)?|throttle|forward|surge|(linear|v)(_?x)?)(_.+)?")
-BODY = re.compile(r"(.+_)?(?P<axis>surge|sway|heave)(_.+)?")
-"""Speeds along a vessel, which are along no axis of the world."""
-AXIS_SPEED = re.compile(r"(.+_)?(v|vel|velocity|linear)?_?(?P<axis>[xy])")
-QUATERNION = re.compile(r"(.+_)?(q|quat(ernion)?|orient(ation)?|rot(ation)?)_?[wxyz]")
+SIDEWAYS = re.compile(r"(.+_)?(sway(_.+)?|(v|vel|velocity|linear)_?y)")
+QUATERNION = re.compile(r"(.+_)?(q|quat(ernion)?|orient(ation)?|rot(ation)?)_?")
+HEADINGS: tuple[tuple[re.Pattern[str], Sequence[str], str, str], ...] = (
+    (HEADING, ("_x", "_y"), "{0}", "{1}"),
+    (HEADING, ("",), "of.cos({0})", "of.sin({0})"),
+    (QUATERNION, "xyzw", "{3} ** 2 - {2} ** 2 + {0} ** 2 - {1} ** 2", "2 * {3} * {2} + 2 * {0} * {1}"),
+    (QUATERNION, "zw", "{1} ** 2 - {0} ** 2", "2 * {1} * {0}"),
+)
+"""How a heading's names begin and end; its cosine and sine by these values."""
 SPEED = re.compile(
     rf"(?<![a-z])(v|d)(?=([xyz]|q|j|{TURNED}|roll|pitch|th|rot|ang|joint)(_|\d|$))|(?<=q)d(?=_?\d|$)|"
     rf"(^|_)({RATE})(?=_|\d|$)"
@@ -157,18 +163,21 @@ class SimulatorKind:
 
 def first_simulator(logs: Logs) -> SimulatorKind:
     """Return a simulator of the first kind that no other predicts `logs` clearly better than."""
-    shares = []
-    for kind in (kinds := _planar(logs)):
-        simulated, still = (errors[:4].reshape(2, 2).sum(axis=1) for errors in kind.errors())
-        shares.append(float(np.divide(simulated, still, np.ones(2), where=still > 0).mean()))
-    good = next((kind for kind, share in zip(kinds, shares, strict=True) if share <= CLEARLY * min(shares)), None)
-    if good and "TRACK_M" in good.constants and min(shares) >= 1:
-        good = None  # two arms rather than two wheels
-    rest = _direct(logs, good)
+    good, direct, kinds = None, _direct(logs, None), _planar(logs)
+    if errors := [[one[:4].reshape(2, 2).sum(axis=1) for one in kind.errors()] for kind in kinds]:
+        shares = [float(np.divide(found, still, np.ones(2), where=still > 0).mean()) for found, still in errors]
+        best = next(at for at, share in enumerate(shares) if share <= CLEARLY * min(shares))
+        good, (simulated, still) = kinds[best], errors[best]
+    along = {name for name, way in good.driven.items() if way != "turn"} if good else set()
+    if good and "left" in good.driven.values() and along <= direct.driven.keys():
+        moved, place = direct.errors()[0], [one.code[0] for one in good.entries[:2]]
+        along_axes = sum(moved[direct.names.index(name)] for name in place) if {*place} <= {*direct.names} else still[0]
+        good = good if simulated[0] < along_axes else None  # two arms, or a base that is driven along x and y
     if not good:
-        if not rest.entries:
+        if not direct.entries:
             raise BadInputError("found no state that a command could move: name it as its command, cmd_q1 and q1")
-        return rest
+        return direct
+    rest = _direct(logs, good)
     merged = {name: getattr(good, name) + getattr(rest, name) for name in ("entries", "lines", "remarks")}
     return replace(good, driven=good.driven | rest.driven, constants=good.constants | rest.constants, **merged)
 
@@ -186,9 +195,7 @@ def identifiers(fields: Sequence[Field], prefix: str = "") -> dict[str, str]:
         plain = f"{prefix}{one.plain}"
         if not plain.isidentifier() or keyword.iskeyword(plain) or plain in ("of", "np", "torch", "state", "self"):
             plain = f"s_{plain}" if f"s_{plain}".isidentifier() else f"s_{len(found)}"
-        while plain in found.values():
-            plain += "_2"
-        found[one.name] = plain
+        found[one.name] = plain + "_2" * list(found.values()).count(plain)
     return found
 
 
@@ -200,31 +207,28 @@ def unpacked(names: Sequence[str]) -> str:
 def _planar(logs: Logs) -> list[SimulatorKind]:
     """Return simulators of robots on a plane, if there are a position and a heading that commands move."""
     states, names = {one.plain: one for one in logs.of("state")}, identifiers(logs.of("state"))
-    position = next(
-        (
-            (name, f"{name.removesuffix(one)}{other}")
-            for one, other in AXES
-            for name in sorted(states, key=len)
-            if name.endswith(one) and f"{name.removesuffix(one)}{other}" in states
-            if PLACE.fullmatch(name) or len(one) > 2
-        ),
-        None,
+    pairs = (
+        (states[name], states[f"{name.removesuffix(one)}{other}"])
+        for one, other in AXES
+        for name in sorted(states, key=len)
+        if name.endswith(one) and f"{name.removesuffix(one)}{other}" in states
+        if PLACE.fullmatch(name) or len(one) > 2
     )
-    if position is None:
-        return []
-    fields = [states[name] for name in position]
-    place = [StateEntry(axis, "m", (one,), (names[one.name],)) for axis, one in zip("xy", fields, strict=True)]
-    found = []
-    for heading, remarks in _headings(states, names, position[0]):
-        for called, driven, lines in _drives(logs.of("command")):
+    found: list[SimulatorKind] = []
+    for fields in islice(pairs, 1):
+        place = [StateEntry(axis, "m", (one,), (names[one.name],)) for axis, one in zip("xy", fields, strict=True)]
+        for (heading, remarks), (called, driven, lines) in product(
+            _headings(states, names, fields[0].plain), _drives(logs.of("command"))
+        ):
             step = ("heading = torch.atan2(heading_y, heading_x)", *lines)
             kind = SimulatorKind(logs, called, (*place, heading), driven, step, _sizes(lines, 1.0, 1.0), remarks)
-            speed, turn = kind.slopes(_forward_and_turn, JUDGED_STEPS)
-            is_off = any(not 0.5 < slope < 2 for slope in (speed, turn))
-            if not kind.constants:
-                found.append(kind)
-            elif speed and turn and (is_off or "TURN_PER_COMMAND" not in kind.constants):
-                found.append(replace(kind, constants=_sizes(lines, speed, turn)))
+            slopes = kind.slopes(_forward_and_turn, JUDGED_STEPS)
+            is_off = all(slopes) and any(not 0.5 < slope < 2 for slope in slopes)
+            if not is_off and "TURN_PER_COMMAND" in kind.constants:
+                step = tuple(line for line in step if "PER_COMMAND" not in line)
+                found.append(replace(kind, lines=step, constants={}))
+            elif all(slopes):
+                found.append(replace(kind, constants=_sizes(lines, *slopes)))
     return found
 
 
@@ -236,80 +240,58 @@ def _sizes(lines: Sequence[str], speed: float, turn: float) -> dict[str, float]:
 
 def _headings(states: dict[str, Field], names: dict[str, str], beside: str) -> list[tuple[StateEntry, tuple[str, ...]]]:
     """Return what the heading may be, of cosine and sine, an angle or a quaternion, and remarks of it."""
-
-    def heading(parts: Sequence[str], cosine: str, sine: str) -> StateEntry:
-        code = [
-            text.format(**{name: names[states[part].name] for name, part in zip("xyzw", parts, strict=False)})
-            for text in (cosine, sine)
-        ]
-        return StateEntry("heading", "1", tuple(states[part] for part in parts), tuple(code))
-
     near = sorted(states, key=lambda name: (-len(os.path.commonprefix([name, beside])), len(name)))  # noqa: RUF071
-    for stem in (name[:-2] for name in near if HEADING.fullmatch(name[:-2])):
-        if {f"{stem}_x", f"{stem}_y"} <= states.keys():
-            return [(heading((f"{stem}_x", f"{stem}_y"), "{x}", "{y}"), ())]
-    for name in filter(HEADING.fullmatch, near):
-        remarks = (f"{states[name].short} is clockwise from the axis of y, as of a compass",)
-        angle, compass = heading([name], "of.cos({x})", "of.sin({x})"), heading([name], "of.sin({x})", "of.cos({x})")
-        ways = [(angle, ()), (compass, remarks)]
+    for (pattern, ends, *code), name in product(HEADINGS, near):
+        stem = name.removesuffix(ends[0])
+        parts = [f"{stem}{end}" for end in ends]
+        if parts[0] != name or not pattern.fullmatch(stem) or not {*parts} <= states.keys():
+            continue
+        fields = tuple(states[part] for part in parts)
+        cosine, sine = (text.format(*(names[one.name] for one in fields)) for text in code)
+        ways: list[tuple[StateEntry, tuple[str, ...]]] = [(StateEntry("heading", "1", fields, (cosine, sine)), ())]
+        if len(ends) == 1:
+            remark = f"{fields[0].short} is clockwise from the axis of y, as of a compass"
+            ways.append((StateEntry("heading", "1", fields, (sine, cosine)), (remark,)))
         return ways[::-1] if re.search("compass|course|cog|azimuth|hdg", name) else ways
-    for stem in (name[:-1] for name in near if QUATERNION.fullmatch(name)):
-        if {f"{stem}{axis}" for axis in "xyzw"} <= states.keys():
-            cosine, sine = "{w} ** 2 - {z} ** 2 + {x} ** 2 - {y} ** 2", "2 * {w} * {z} + 2 * {x} * {y}"
-            return [(heading([f"{stem}{axis}" for axis in "xyzw"], cosine, sine), ())]
-        if {f"{stem}{axis}" for axis in "zw"} <= states.keys():
-            return [(heading([f"{stem}{axis}" for axis in "zw"], "{y} ** 2 - {x} ** 2", "2 * {y} * {x}"), ())]
     return []
 
 
 def _drives(commands: Sequence[Field]) -> list[tuple[str, dict[str, str], tuple[str, ...]]]:
     """Return kinds of drives that have such commands, variables of these and lines of a step; then other units."""
-    along = ("x = x + speed * heading.cos() * TIMESTEP_S", "y = y + speed * heading.sin() * TIMESTEP_S")
     turning = "heading = heading + turn * TIMESTEP_S"
+    along: tuple[str, ...] = (
+        "x = x + speed * heading.cos() * TIMESTEP_S",
+        "y = y + speed * heading.sin() * TIMESTEP_S",
+        turning,
+    )
     sides = [side for command in commands if (side := SIDE.search(command.plain))]
     if len(commands) == 2 == len(sides) and len({SIDE.sub("", command.plain) for command in commands}) == 1:
         driven = {c.name: "left" if side[1] else "right" for c, side in zip(commands, sides, strict=True)}
-        speed, turn = (
-            "speed = SPEED_PER_COMMAND * (left + right) / 2",
-            "turn = SPEED_PER_COMMAND * (right - left) / TRACK_M",
-        )
-        return [("a differential drive", driven, (speed, turn, *along, turning))]
+        speed = "speed = SPEED_PER_COMMAND * (left + right) / 2"
+        return [
+            ("a differential drive", driven, (speed, "turn = SPEED_PER_COMMAND * (right - left) / TRACK_M", *along))
+        ]
     turns = [c for c in commands if _is_turn_rate(c) or (TURN.fullmatch(c.plain) and c.unit != "m/s")]
     turns = turns or [command for command in commands if command.unit == "rad/s"]
     straight = [command for command in commands if command not in turns]
-    axes = {"x": "forward", "surge": "forward", "y": "left", "sway": "left"}
-    ways = {
-        axes.get(m["axis"]): c
-        for c in straight
-        if (m := BODY.fullmatch(c.plain) or AXIS_SPEED.fullmatch(c.plain)) and c.unit in ("1", "m/s")
-    }
-    found: list[tuple[str, dict[str, str], tuple[str, ...]]] = []
-    if {"forward", "left"} <= ways.keys():
-        turned, end = {turn.name: "turn" for turn in turns[:1]}, (turning,) * bool(turns)
-        x, y = "forward * heading.cos() - left * heading.sin()", "forward * heading.sin() + left * heading.cos()"
-        frames = [("a holonomic base", ("forward", "left"), (x, y))]
-        if not any(BODY.fullmatch(way.plain) for way in ways.values()):
-            frames.append(("a holonomic base, driven along x and y", ("east", "north"), ("east", "north")))
-        for called, names, speeds in frames:
-            driven = dict(zip((ways["forward"].name, ways["left"].name), names, strict=True)) | turned
-            moves = [f"{at} = {at} + ({by}) * TIMESTEP_S" for at, by in zip("xy", speeds, strict=True)]
-            found.append((called, driven, (*moves, *end)))
-    else:
-        called = "a unicycle"
-        if len(commands) == 2 and not turns:
-            straight, turns = [commands[0]], [commands[1]]
-            called += f" (CHECK: {turns[0].short} is used as a turn rate, although nothing says so)"
-        ahead = [c for c in straight if len(commands) == 2 or c.unit == "m/s" or AHEAD.fullmatch(c.plain)]
-        if not turns or not ahead:
-            return []
-        if turns[0].unit in ("1", "rad") and STEERING.fullmatch(turns[0].plain):
-            driven = {ahead[0].name: "speed", turns[0].name: "angle"}
-            found.append(("a bicycle", driven, ("turn = speed * angle.tan() / WHEELBASE_M", *along, turning)))
-        found.append((called, {ahead[0].name: "speed", turns[0].name: "turn"}, (*along, turning)))
-    used = [name for name in ("speed", "turn") if name in found[-1][1].values()]
+    aside = [c for c in straight if c.unit in ("1", "m/s") and SIDEWAYS.fullmatch(c.plain)]
+    called, used = "a unicycle", ["speed", "turn"]
+    if len(commands) == 2 and not turns and not aside:
+        straight, turns = [commands[0]], [commands[1]]
+        called += f" (CHECK: {turns[0].short} is used as a turn rate, although nothing says so)"
+    ahead = [c for c in straight if len(commands) == 2 or c.unit == "m/s" or AHEAD.fullmatch(c.plain)]
+    if not (turns or aside) or not ahead:
+        return []
+    driven, found = dict(zip([one.name for one in (ahead[0], *turns[:1])], used, strict=False)), []
+    if turns and turns[0].unit in ("1", "rad") and STEERING.fullmatch(turns[0].plain):
+        lines = ("turn = speed * angle.tan() / WHEELBASE_M", *along)
+        found.append(("a bicycle", {ahead[0].name: "speed", turns[0].name: "angle"}, lines))
+    if aside:
+        called, driven, used = "a holonomic base", driven | {aside[0].name: "left"}, ["turn"] * bool(turns)
+        x, y = "x - left * heading.sin() * TIMESTEP_S", "y + left * heading.cos() * TIMESTEP_S"
+        along = (f"x = {x}", f"y = {y}", *along[: 2 + bool(turns)])
     factors = [f"{name} = {name.upper()}_PER_COMMAND * {name}" for name in used]
-    scaled = [(called, driven, (*factors, *lines)) for called, driven, lines in found if called != "a bicycle"]
-    return found + scaled if factors else found
+    return [*found, (called, driven, (*factors, *along))]
 
 
 def _is_turn_rate(command: Field) -> bool:
@@ -327,66 +309,58 @@ def _forward_and_turn(before: Floats, after: Floats) -> Floats:
 
 def _direct(logs: Logs, planar: SimulatorKind | None) -> SimulatorKind:
     """Return the simulator of the other commands: each moves the state of the same name."""
-    taken = [one for entry in planar.entries for one in entry.fields] if planar else []
-    left = [one for one in logs.of("state") if one not in taken]
-    moves: list[tuple[Field, list[Field]]] = []
+    left = [one for one in logs.of("state") if not planar or all(one not in entry.fields for entry in planar.entries)]
+    moves: dict[Field, list[Field]] = {}
     for command in (one for one in logs.of("command") if not planar or one.name not in planar.driven):
-        moves.append((command, _moved(command, left, is_alone=len(logs.of("command")) == 1)))
-        left = [one for one in left if one not in moves[-1][1]]
-    idle = [command.short for command, found in moves if not found]
+        moves[command] = _moved(command, left, is_alone=len(logs.of("command")) == 1)
+        left = [one for one in left if one not in moves[command]]
+    idle = [command.short for command in moves if not moves[command]]
     remarks = [f"{' and '.join(idle)} {'has' if len(idle) == 1 else 'have'} no effect"] if idle else []
     if turned := [one.short for one in left if HEADING.fullmatch(one.plain) or "angle" in one.plain]:
         are, them = ("is", "it") if len(turned) == 1 else ("are", "them")
         remarks.append(f"{' and '.join(turned)} {are} not in φ, though failures may come of {them}")
-    moves = [(command, found) for command, found in moves if found]
     inputs, variables = identifiers(logs.of("state")), identifiers(logs.of("command"), "cmd_")
     words = {"x", "y", "heading", *planar.driven.values()} if planar else set()
     names = {key: f"s_{name}" if name in words else name for key, name in inputs.items()}
-    driven = {command.name: variables[command.name] for command, _ in moves}
-
-    def simulator(rates: Sequence[bool], constants: dict[str, float]) -> SimulatorKind:
-        entries, lines = [], []
-        for (command, found), is_rate in zip(moves, rates, strict=True):
-            given, at, now = variables[command.name], [names[one.name] for one in found], names[found[0].name]
-            for one in found:
-                code: tuple[str, ...] = (inputs[one.name],)
-                if (
-                    one.unit == "rad"
-                    and HEADING.fullmatch(one.plain)
-                    and np.ptp(np.concatenate(logs.values([one]))) > np.pi
-                ):
-                    code = (f"of.cos({code[0]})", f"of.sin({code[0]})")
-                    now = f"torch.atan2({now}_y, {now}_x)"
-                entries.append(StateEntry(names[one.name], one.unit, (one,), code))
-            if command.unit in FORCES:
-                lines.append(f"{at[-1]} = {at[-1]} + {at[-1].upper()}_PER_FORCE * {given} * TIMESTEP_S")
-                lines += [f"{at[0]} = {at[0]} + {at[1]} * TIMESTEP_S"] if len(at) > 1 else []
-            else:
-                lines.append(f"{at[0]} = {now} + {given} * TIMESTEP_S" if is_rate else f"{at[0]} = {given}")
-        return SimulatorKind(logs, DIRECT, tuple(entries), driven, tuple(lines), constants, tuple(remarks))
-
-    pushed = [names[found[-1].name] for command, found in moves if command.unit in FORCES]
-    plain = simulator([True] * len(moves), {f"{name.upper()}_PER_FORCE": 1.0 for name in pushed})
-    if not moves:
-        return plain
-    places = {entry.fields[0]: [plain.names.index(name) for name in entry.names] for entry in plain.entries}
-    at = [plain.names.index(name) for name in pushed]
-    slopes = plain.slopes(lambda before, after: (after - before)[:, at], 1) if at else []
-    gains = dict(zip(plain.constants, slopes, strict=True))
-    one, other = (simulator([is_rate] * len(moves), gains).errors()[0] for is_rate in (True, False))
-    rates = []
-    for command, (state, *_) in moves:  # whether it is what is commanded, or what the command is a rate of
+    entries: dict[Field, StateEntry] = {}
+    lines: list[tuple[str, str]] = []  # of each command: as a rate, and as a target
+    pushed, moved = [], [(command, found) for command, found in moves.items() if found]
+    for command, found in moved:
+        given, at, now = variables[command.name], [names[one.name] for one in found], names[found[0].name]
+        for one in found:
+            code: tuple[str, ...] = (inputs[one.name],)
+            is_angle = one.unit == "rad" and HEADING.fullmatch(one.plain)
+            if is_angle and np.ptp(np.concatenate(logs.values([one]))) > np.pi:
+                code, now = (f"of.cos({code[0]})", f"of.sin({code[0]})"), f"torch.atan2({now}_y, {now}_x)"
+            entries[one] = StateEntry(names[one.name], one.unit, (one,), code)
+        lines.append((f"{at[0]} = {now} + {given} * TIMESTEP_S", f"{at[0]} = {given}"))
+        if command.unit in FORCES:
+            pushed.append(at[-1])
+            push = f"{at[-1]} = {at[-1]} + {at[-1].upper()}_PER_FORCE * {given} * TIMESTEP_S"
+            lines[-1] = (push + f"\n        {at[0]} = {at[0]} + {at[-1]} * TIMESTEP_S" * (len(at) > 1),) * 2
+    driven = {command.name: variables[command.name] for command, _ in moved}
+    gains, rates = {f"{name.upper()}_PER_FORCE": 1.0 for name in pushed}, tuple(rate for rate, _ in lines)
+    kind = SimulatorKind(logs, DIRECT, tuple(entries.values()), driven, rates, gains, tuple(remarks))
+    if pushed:
+        speeds = [kind.names.index(name) for name in pushed]
+        slopes = kind.slopes(lambda before, after: (after - before)[:, speeds], 1)
+        kind = replace(kind, constants=dict(zip(gains, slopes, strict=True)))
+    if not moved:
+        return kind
+    errors = kind.errors()[0], replace(kind, lines=tuple(target for _, target in lines)).errors()[0]
+    chosen = []
+    for (command, (state, *_)), ways in zip(moved, lines, strict=True):
+        values = [kind.names.index(name) for name in entries[state].names]
+        rate, target = (error[values].sum() for error in errors)
         is_same = command.unit == state.unit
         if "1" in (command.unit, state.unit):
             is_same = _is_speed(state) and command.plain == state.plain
-        rates.append(not is_same and bool(one[places[state]].sum() <= other[places[state]].sum()))
-    return simulator(rates, gains)
+        chosen.append(ways[is_same or bool(rate > target)])
+    return replace(kind, lines=tuple(chosen))
 
 
 def _moved(command: Field, states: Sequence[Field], *, is_alone: bool) -> list[Field]:
     """Return the state that a command moves, or the place and speed that a force does; nothing if none."""
-    if BODY.fullmatch(command.plain):
-        return [one for one in states if one.plain == command.plain]
     unit = "rad/s" if _is_turn_rate(command) else command.unit
     fitting = [one for one in states if "1" in (unit, one.unit) or one.unit in (unit, unit.removesuffix("/s"))]
     same = sorted((one for one in states if _key(one) == _key(command)), key=_is_speed)

@@ -103,7 +103,6 @@ def _values(name: str, simulator: SimulatorKind) -> dict[str, str]:
     split = [f"field = {_code(field.name)}\n" for field in logs.of("episode")[:1]]
     if time:
         split.append(f"gap_s = {5 / logs.rate!r}  # a longer step begins a new episode\n")
-    check = logs.uneven if time else "the logs have no time field"
     row, command = logs.values(states)[0][:1], logs.values(commands)[0][:1]
     first = simulator.episodes()[0][0][:1]
     given = np.concatenate(logs.values(commands))
@@ -119,7 +118,7 @@ def _values(name: str, simulator: SimulatorKind) -> dict[str, str]:
         "simulator": simulator.code(),
         "simulator_line": simulator.described,
         "timestep_s": repr(1 / logs.rate),
-        "rate_hz": f"{logs.rate}" + (f"  # CHECK: {check}" if check else ""),
+        "rate_hz": f"{logs.rate}" + (f"  # CHECK: {logs.uneven}" if logs.uneven else ""),
         "time": "".join(time),
         "not_finite": 'not_finite = "split"  # CHECK: rows with a missing number end the episode\n'
         * bool(logs.left_out),
@@ -175,10 +174,7 @@ def _objective(simulator: SimulatorKind) -> dict[str, str]:
         "start_size": str(len(pairs)),
         "drawn": ", ".join(drawn),
         "target": f"goal[..., {taken}]" if taken else "state.new_tensor(GOAL)",
-        "seen": "cos * east + sin * north, cos * north - sin * east",
     }
-    if "east" in simulator.driven.values():
-        values["seen"] = "east, north"  # of a robot that is commanded along the axes of the world
     sizes = [f"\n{name} = {value!r}  # CHECK: fitted to the logs" for name, value in simulator.constants.items()]
     return {
         "names": _code(tuple(simulator.names)),

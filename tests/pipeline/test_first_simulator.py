@@ -90,8 +90,7 @@ def drone() -> Columns:
         "x": summed(vx),
         "y": summed(vy),
         "z": summed(vz),
-        "yaw_x": np.cos(summed(turn)),
-        "yaw_y": np.sin(summed(turn)),
+        "yaw": wrapped(summed(turn)),
     }
     return place | {"vx_sp": vx, "vy_sp": vy, "vz_sp": vz, "yawspeed_sp": turn}
 
@@ -126,7 +125,7 @@ KINDS: dict[str, tuple[Callable[[], Columns], str]] = {
         "a differential drive: x, y, theta, moved by left, right; speed_per_command 0.1; track_m 0.4",
     ),
     "vessel": (vessel, "a holonomic base: x, y, qz, qw, moved by surge, sway, yaw_rate; CHECK: heave has no effect"),
-    "drone": (drone, "a holonomic base, driven along x and y: x, y, yaw_x, yaw_y, z, moved by vx, vy, vz, yawspeed"),
+    "drone": (drone, "values that commands move: x, y, z, yaw, moved by vx, vy, vz, yawspeed"),
     "arm": (arm, "values that commands move: elbow, grip, moved by elbow, grip; CHECK: fan has no effect"),
     "pushed": (pushed, "values that commands move: q1, dq1, moved by tau1; dq1_per_force 2.5"),
 }

@@ -158,37 +158,44 @@ def _plain(fields: Iterable[str]) -> list[str]:
     return [field.partition(":")[2] for field in fields if ":" in field]
 
 
-def _read(source: Source, fields: Sequence[str], numbers: Sequence[str]) -> Block | None:
-    """Return the rows of `fields`, None if there are none; those that are not among `numbers` stay text."""
+def texts_of(source: Source, fields: Sequence[str] = ()) -> tuple[dict[str, pa.StringArray], bool, list[str]]:
+    """Return the cells of `fields`, or of all; whether a last line is cut off and left out; and the names of all."""
     with explained(str(source), source):
-        with source.open() as stream:
-            if not re.search(rb"[\r\n]", stream.readline(2**20)):
-                return None  # only just begun
         content, is_torn = whole_lines(source, str(source))
         options = csv.ParseOptions(delimiter=delimiter_of(str(source)))
         header = csv.open_csv(io.BytesIO(content), parse_options=options).schema.names
+        known = [name for name in header if name]
+        fields = fields or known
         row_count(str(source), fields, dict.fromkeys(header, (0,)))
         if doubled := sorted({name for name in fields if header.count(name) > 1}):
             raise BadInputError(f"{source}: the header has {', '.join(doubled)} more than once")
-        table = csv.read_csv(
-            io.BytesIO(content),
-            parse_options=options,
-            convert_options=csv.ConvertOptions(
-                column_types=dict.fromkeys(fields, pa.string()), strings_can_be_null=True, include_columns=fields
-            ),
-        )
-    if not table.num_rows:
+        kinds = dict.fromkeys(fields, pa.string())
+        reading = csv.ConvertOptions(column_types=kinds, strings_can_be_null=True, include_columns=list(kinds))
+        table = csv.read_csv(io.BytesIO(content), parse_options=options, convert_options=reading)
+    return {name: table.column(name).combine_chunks() for name in kinds}, is_torn, known
+
+
+def _read(source: Source, fields: Sequence[str], numbers: Sequence[str]) -> Block | None:
+    """Return the rows of `fields`, None if there are none; those that are not among `numbers` stay text."""
+    with source.open() as stream:
+        if not re.search(rb"[\r\n]", stream.readline(2**20)):
+            return None  # only just begun
+    columns, is_torn, known = texts_of(source, fields)
+    if not len(columns[fields[0]]):
         return None
-    columns = {name: table.column(name).combine_chunks() for name in fields}
     values = {
-        name: _numbers(cells, source, name) if name in numbers else np.array(cells.to_pylist(), dtype=str)
+        name: numbers_of(cells, source, name) if name in numbers else np.array(cells.to_pylist(), dtype=str)
         for name, cells in columns.items()
     }
-    known = [name for name in header if name]
     return Block(values, str(source), torn=is_torn, line=partial(line_of, source), known=known)
 
 
-def _numbers(texts: pa.StringArray, source: Source, field: str) -> Array:
+def is_number(text: str) -> bool:
+    """Return whether a cell holds a number, or true or false."""
+    return bool(_NUMBER.fullmatch(text.strip())) or text.strip().lower() in ("", "true", "false")
+
+
+def numbers_of(texts: pa.StringArray, source: Source, field: str) -> Array:
     """Return the numbers of a field's `texts`, without blanks around them."""
     trimmed = pc.utf8_trim_whitespace(texts)
     texts = pc.if_else(pc.equal(trimmed, ""), pa.scalar(None, pa.string()), trimmed)
@@ -201,7 +208,7 @@ def _numbers(texts: pa.StringArray, source: Source, field: str) -> Array:
     lists = [_LIST.fullmatch(text or "") for text in cells]
     if not any(lists):
         words = [row for row, cell in enumerate(cells) if cell and not _NUMBER.fullmatch(cell)]
-        row = ([row for row in words if cells[row].lower() not in ("true", "false")] or words or [0])[0]
+        row = ([row for row in words if not is_number(cells[row])] or words or [0])[0]
         expected = f"numbers, or true and false, got '{cells[row]}'"
         raise BadInputError(f"{source} line {line_of(source, row)}: field '{field}': expected {expected}")
     rows: list[list[float]] = []  # of cells that are lists, "[0.1, 2]" or "[0.1 2]"
