@@ -30,10 +30,12 @@ def fit(one: nn.Linear, descent: Descent, until: int = CONFIG.updates) -> nn.Lin
     return one
 
 
-def test_it_is_adam_down_a_half_cosine_with_clipped_gradients() -> None:
+def test_it_is_adamw_down_a_half_cosine_with_clipped_gradients() -> None:
     ours, theirs = model(), model()
-    fit(ours, Descent(ours, CONFIG))
-    optimizer = torch.optim.Adam(theirs.parameters(), lr=0.05)
+    fit(ours, descent := Descent(ours, CONFIG, weight_decay=0.1))
+    ours.bias.requires_grad_(False)
+    assert len(descent.parameters) == 2 and len(Descent(ours, CONFIG).parameters) == 1
+    optimizer = torch.optim.AdamW(theirs.parameters(), lr=0.05, weight_decay=0.1)
     for update in range(40):
         for group in optimizer.param_groups:
             group["lr"] = 0.05 * (1 + math.cos(math.pi * update / 40)) / 2

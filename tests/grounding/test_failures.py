@@ -307,8 +307,14 @@ def test_members_are_networks_of_two_hidden_layers_each() -> None:
         hidden = elu(hidden @ members.second_weight[number] + members.second_bias[number])
         expected = (hidden @ members.last_weight[number] + members.last_bias[number]).squeeze(-1)
         torch.testing.assert_close(found, expected, atol=1e-6, rtol=1e-5)
+    wide = Members(1, 4, 64, dropout=0.0)
+    assert float(wide.second_weight.detach().abs().max()) == pytest.approx(64**-0.5, rel=0.05)
     members.train()
     assert not torch.equal(members(inputs), members(inputs))  # entries are dropped at random
+    with torch.no_grad():
+        first.weight.zero_()
+    first.bias.data.zero_()
+    assert not torch.equal(members(inputs), members(inputs))  # of both hidden layers
 
 
 def test_averages_forget_with_their_time_constants() -> None:

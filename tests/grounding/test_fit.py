@@ -6,7 +6,7 @@ import pytest
 import torch
 from toy_episodes import toy_episodes
 
-from astra_data.core.progress import silent
+from astra_data.core.progress import Progress, silent
 from astra_data.grounding import fit as fit_module
 from astra_data.grounding.fit import Fitting, GroundConfig, HistoryFit, recorded_clearance_m, with_own_rewards
 from astra_data.grounding.history import HistoryGrounding
@@ -26,7 +26,7 @@ def test_residual_rewards_are_what_abstract_states_do_not_explain() -> None:
     terminated = torch.tensor([False, True, True, False, False])
     ahead = float(task.objective.reward(away[None], near[None], goal[None], torch.zeros(1, dtype=torch.bool)))
     assert 0.1 < ahead < 2.0
-    reward, failed = torch.tensor([[3.0, 5.0, -9.0, 2.0, 0.0]]), torch.tensor([[0.0, 0.0, 1.0, 0.0, 0.0]])
+    reward, failed = torch.tensor([[3.0, 5.0, -9.0, 2.0, 0.0]]), torch.tensor([[0.0, 0.0, 1.0, 1.0, 0.0]])
     still = torch.zeros(1, 5, 2)
     given = toy_episodes(
         torch.cat([before[None], still], dim=-1),
@@ -73,16 +73,23 @@ def episodes(seed: int, count: int = 4, failing: int = 1) -> PairedEpisodes:
 
 
 def fit(
-    folder: Path, of: HistoryFit | None = None, *, failing: int = 1, seed: int = 0, **settings: Any
+    folder: Path,
+    of: HistoryFit | None = None,
+    *,
+    task: Task = TASK,
+    failing: int = 1,
+    seed: int = 0,
+    progress: Progress = silent,
+    **settings: Any,
 ) -> tuple[HistoryGrounding, dict[str, Any], Fitting]:
     config = GroundConfig(updates=3, batch_windows=4, window=5, latent_size=8).model_copy(update=settings)
     training, held_out = episodes(0, failing=failing), episodes(1, 3, failing=min(failing, 2))
-    fitting = Fitting(TASK, config, None, training, held_out, seed, "cpu", folder, silent)
+    fitting = Fitting(task, config, None, training, held_out, seed, "cpu", folder, progress)
     return *(of or HistoryFit(latent=True, reward=True))(fitting), fitting
 
 
 def test_scales_and_sizes_are_of_the_training_episodes(tmp_path: Path) -> None:
-    grounding, metrics, fitting = fit(tmp_path)
+    grounding, metrics, fitting = fit(tmp_path, window=12)
     model, training = grounding.model, fitting.training
     torch.testing.assert_close(model.state_mean, training.steps(training.windows.state).mean(0))
     error = training.windows.next_state - training.windows.simulated_next
@@ -90,7 +97,30 @@ def test_scales_and_sizes_are_of_the_training_episodes(tmp_path: Path) -> None:
     shape = model.shape
     assert (shape.latent_size, shape.corrects_reward, shape.goal_size) == (8, True, 2)
     assert (shape.position_octaves, shape.ball_index) == (4, None)
-    assert (metrics["updates"], metrics["window"], len(metrics["epochs"])) == (3, 5, 1)
+    assert (metrics["updates"], metrics["window"], len(metrics["epochs"])) == (3, 10, 1)
+    assert grounding.scatter_model is not None and fitting.descent.updates == 3
+    assert len(grounding.scatter_model.forms) == 26  # residuals of held-out steps
+    loss, _ = model.losses(with_own_rewards(TASK, fitting.held_out).windows, LossWeights(latent=0.0))
+    assert metrics["epochs"][0]["held_out_error"] == pytest.approx(float(loss.detach()))
+    assert replace(fitting, config=GroundConfig(batch_windows=1, window=1)).descent.updates == 32 * 36
+    assert HistoryFit(latent=False, reward=False).weights(fitting.config) == LossWeights(0.0, 0.0)
+    of = HistoryFit(latent=False, reward=False, failures=False, scatter=False)
+    placeless = replace(TASK, plane=None, quantities={"ball_position_m": (2, 3)})
+    shape = fit(tmp_path / "placeless", of, task=placeless)[0].model.shape
+    assert (shape.position_octaves, shape.ball_index) == (0, 2)
+
+
+def test_all_that_is_drawn_comes_from_the_seed(tmp_path: Path) -> None:
+    of = HistoryFit(latent=False, reward=False, failures=False, scatter=False)
+
+    def weights(name: str, progress: Progress = silent, **settings: Any) -> torch.Tensor:
+        model = fit(tmp_path / name, of, updates=11, progress=progress, **settings)[0].model
+        return torch.cat([parameter.flatten() for parameter in model.parameters()])
+
+    once = weights("once")
+    assert torch.equal(once, weights("again", lambda *_: torch.manual_seed(5)))
+    begun = [weights(f"seed {seed}", seed=seed, learning_rate=1e-12) for seed in (0, 1)]
+    assert (begun[0] - begun[1]).abs().max() > 0.01
 
 
 @pytest.mark.parametrize("printed", [False, True])
@@ -199,10 +229,11 @@ def test_a_fit_takes_it_from_its_training_episodes_but_as_printed_and_where_touc
 ) -> None:
     """Failure models are fitted to replays that keep clear."""
     task = replace(TASK, objective=replace(TASK.objective, ends_at_walls=at_walls))
-    given: list[float | None] = []
+    given, seen = list[float | None](), list[PairedEpisodes]()
 
-    def noted(task: Task, grounding: HistoryGrounding, *others: object) -> tuple[None, None]:
+    def noted(task: Task, grounding: HistoryGrounding, *others: Any) -> tuple[None, None]:
         given.append(grounding.clearance_m)
+        seen.extend(one for one in others if isinstance(one, PairedEpisodes))
         return None, None
 
     monkeypatch.setattr("astra_data.grounding.fit.fit_failures", noted)
@@ -214,5 +245,6 @@ def test_a_fit_takes_it_from_its_training_episodes_but_as_printed_and_where_touc
     fit = HistoryFit(latent=False, reward=False, scatter=False, printed=printed)
     grounding, metrics = fit(fitting)
     assert grounding.fails_at_walls == at_walls
+    assert [float(one.windows.state[0, 0, 1]) for one in seen] == [TOP_M - 1.0, TOP_M - 0.5]
     expected = None if printed or at_walls else pytest.approx(1.0, abs=0.11)
     assert grounding.clearance_m == metrics.get("clearance_m") == given[0] == given[1] == expected
