@@ -230,6 +230,9 @@ def test_a_correction_is_added_in_the_units_of_the_data() -> None:
     torch.testing.assert_close(used.correction_inputs(latent, action, landed), inputs)
     torch.testing.assert_close(used.correct(latent, action, landed), expected)
     assert (expected - landed).abs().max() > 1e-3
+    beside = GroundingModel(GroundingShape(6, 2, 2, latent_size=8, position_octaves=0, ball_index=4))
+    near = beside.state_features(torch.tensor([1.0, 2.0, 0.0, 0.0, 1.03, 1.96]))
+    assert near[6:].tolist() == pytest.approx([0.3, -0.4, 0.5], abs=1e-4)  # of the ball, in 0.1 m
 
 
 def test_the_loss_of_the_correction_is_its_squared_error_in_units_of_the_data() -> None:

@@ -67,7 +67,7 @@ LIMITS = Commands({"v": (-1.0, 3.0), "w": (-2.0, 2.0)})
 
 def test_steps_of_active_robots_beyond_any_axis_are_counted() -> None:
     asked = RecordedRange(torch.tensor([0.0, -1.0]), torch.tensor([1.0, 1.0]), LIMITS)
-    commands = torch.tensor([[0.5, 0.0], [1.005, -1.01], [1.2, 0.0], [0.5, -1.2], [-0.02, 0.0], [3.0, 2.0]])
+    commands = torch.tensor([[0.5, 0.0], [1.005, -1.015], [1.2, 0.0], [0.5, -1.2], [-0.02, 0.0], [3.0, 2.0]])
     active = torch.tensor([True, True, True, True, True, False])
     asked.count(LIMITS.normal(commands), active)
     assert asked.share == 3 / 5

@@ -98,6 +98,15 @@ def test_the_density_of_an_action_is_that_of_its_distribution() -> None:
         torch.testing.assert_close(policy.log_prob(OBSERVATION, action), expected, atol=1e-4, rtol=1e-4)
         for bound in (1.0, -1.0):
             assert policy.log_prob(OBSERVATION, torch.full((3, 5, 2), bound)).isfinite().all()
+        if isinstance(policy, SoftActor):
+            drawn, density = policy.sample(OBSERVATION)
+            torch.testing.assert_close(density, policy.log_prob(OBSERVATION, drawn), atol=1e-3, rtol=1e-3)
+            policy.actor[-1].requires_grad_(False).weight.zero_()
+            policy.actor[-1].bias.zero_()
+            torch.testing.assert_close(policy.policy(OBSERVATION)[1], torch.full((3, 5, 2), 1.001))
+        else:
+            sizes = [network[-1].weight.norm(dim=1).max().item() for network in (policy.actor, policy.critic)]
+            assert sizes == pytest.approx([0.01, 1.0], rel=1e-3)
 
 
 SHAPE = AdaptiveShape(3, 2, memory_size=8, hidden_sizes=(16,), extrinsics_size=4, history_length=45)
@@ -121,6 +130,7 @@ def test_features_are_those_of_an_actor_critic_and_the_extrinsics() -> None:
     hidden = student.initial_hidden(5)
     seen, hidden = student.remember(observed[:, 0, :3], action[:, 0], hidden)
     torch.testing.assert_close(seen[:, :11], remembered[:, 0])
+    assert torch.equal(hidden[:, -5:], torch.cat([observed[:, 0, :3], action[:, 0]], dim=-1))
     assert torch.equal(seen[:, 11:], student.adaptation(hidden[:, 8:]))
 
 
