@@ -156,6 +156,9 @@ def test_a_failure_models_memory_is_kept_and_forgotten_at_a_start() -> None:
     resumed.step(played[4])
     torch.testing.assert_close(resumed.failure_risk(), wanted)
 
+    known = torch.rand(3, 8 + 15)
+    one.start(HERE.expand(3, 4), ROWS, GOAL, hidden=known)
+    assert torch.equal(one.state_dict()["remembered"][:, -15:], known[:, 8:])
     one.start(HERE.expand(3, 4), ROWS, GOAL)
     one.step(played[0])
     fresh = simulator(used, failures)

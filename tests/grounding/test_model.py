@@ -231,8 +231,10 @@ def test_a_correction_is_added_in_the_units_of_the_data() -> None:
     torch.testing.assert_close(used.correct(latent, action, landed), expected)
     assert (expected - landed).abs().max() > 1e-3
     beside = GroundingModel(GroundingShape(6, 2, 2, latent_size=8, position_octaves=0, ball_index=4))
-    near = beside.state_features(torch.tensor([1.0, 2.0, 0.0, 0.0, 1.03, 1.96]))
-    assert near[6:].tolist() == pytest.approx([0.3, -0.4, 0.5], abs=1e-4)  # of the ball, in 0.1 m
+    beside.state_mean.fill_(1.0)
+    near = beside.state_features(torch.tensor([1.0, 2.0, 0.0, 0.0, 1.03, 1.96])).tolist()
+    # Of the ball, in 0.1 m.
+    assert near == pytest.approx([0.0, 1.0, -1.0, -1.0, 0.03, 0.96, 0.3, -0.4, 0.5], abs=1e-4)
 
 
 def test_the_loss_of_the_correction_is_its_squared_error_in_units_of_the_data() -> None:
@@ -273,12 +275,18 @@ def test_the_latent_loss_follows_the_slow_encoder() -> None:
     _, parts = used.losses(given, LossWeights())
     expected = -likelihood[both].mean() - 0.5 * math.log(2 * math.pi)
     torch.testing.assert_close(parts["latent"], expected)
+    before = [parameter.clone() for parameter in used.target_encoder.parameters()]
+    used.update_target()
+    followed = zip(used.target_encoder.parameters(), before, used.encoder.parameters(), strict=True)
+    for after, was, fast in followed:
+        torch.testing.assert_close(after, 0.99 * was + 0.01 * fast.detach())
 
 
 def test_the_target_of_the_latent_loss_gives_no_gradient() -> None:
     used, given = model(), windows()
     for parameter in used.latent_dynamics.parameters():  # predictions without a gradient to the latents
         parameter.data.zero_()
+    assert (used.predict_latent(torch.zeros(3, 8), torch.zeros(3, 2))[1] == -2.0).all()  # midway of the bounds
     used.losses(given, replace(NOTHING, latent=1.0))[0].backward()
     gradient = next(used.encoder.parameters()).grad
     assert gradient is None or not gradient.any()
@@ -346,6 +354,10 @@ def test_shares_of_variance_are_those_of_real_steps() -> None:
     assert figures["r2_latent"] == pytest.approx(r2(mean[both], latent[:, 1:][both]), rel=1e-4)
     corrected = used.correct(latent, windows.action, windows.simulated_next)
     assert figures["r2_state"] == correction_r2(corrected, windows, used.correction_std)
+    two = GroundingModel(GroundingShape(4, 2, 2, latent_size=6, head_sizes=(8,))).requires_grad_(False)
+    whole = two.rewards(two.encode(windows)[0], windows.action)[paid][:, 0]  # not the residual
+    residual = replace(given, windows=replace(windows, own_reward=torch.randn(4, 12)))
+    assert telemetry(two, residual, WEIGHTS)["r2_reward"] == pytest.approx(r2(whole, reward[paid]), rel=1e-4)
 
 
 def test_the_latents_spread_and_rank() -> None:

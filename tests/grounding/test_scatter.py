@@ -5,6 +5,7 @@ from collections.abc import Iterator
 
 import pytest
 import torch
+from grounding_models import HERE
 from torch.distributions import Normal
 from toy_episodes import toy_episodes
 
@@ -13,6 +14,7 @@ from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.model import GroundingModel, GroundingShape
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.scatter import ScatterModel, ScatterShape, fit_scatter
+from astra_data.grounding.simulator import EpisodeSimulator
 from astra_data.robots.registry import TASKS
 
 TASK = TASKS["antmaze-umaze"]
@@ -72,6 +74,19 @@ def test_the_scale_is_told_by_the_moment_and_the_forms_are_those_of_held_out_ste
     assert figures["kurtosis"] == pytest.approx(3.0, abs=0.6)
 
 
+def test_forms_are_drawn_from_the_seed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("astra_data.grounding.scatter._DESCENT", DescentConfig(updates=1, learning_rate=1e-9))
+    monkeypatch.setattr("astra_data.grounding.scatter._MOST_FORMS", 100)
+    given = grounding_model(), scattered_episodes(0, 4), scattered_episodes(1, 4)
+    (one, figures), (other, _) = (fit_scatter(*given, seed) for seed in (0, 1))
+    assert len(one.forms) == 100 and (one.forms - other.forms).abs().max() > 0.1
+    windows = given[2].windows
+    power = given[2].steps(windows.next_state - windows.simulated_next).square()
+    kurtosis = power.square().mean(0) / power.mean(0).square()
+    assert figures["kurtosis"] == pytest.approx(float(kurtosis.mean()), rel=1e-4)
+    assert figures["gain_nats"] == pytest.approx(0.0, abs=1e-4)
+
+
 def even(size: float = 0.05) -> ScatterModel:
     """Return a model with two forms, to the left and to the right."""
     shape = grounding_model().shape
@@ -90,6 +105,24 @@ def test_corrected_states_are_scattered_and_replays_are_not() -> None:
     apart = worlds[0].step(torch.zeros(64, 2)) - worlds[1].step(torch.zeros(64, 2))
     assert sorted({round(value, 4) for value in apart[:, 0].tolist()}) == [-0.05, 0.05]
     assert apart[:, 1:].abs().max() < 1e-6
+
+
+def test_where_touches_are_failures_they_are_those_of_the_correction() -> None:
+    def beside_a_wall(push_m: float, *, fails_at_walls: bool) -> EpisodeSimulator:
+        model = grounding_model()
+        list(model.correction.parameters())[-1][0] = push_m
+        world = HistoryGrounding(model, scatter_model=even(0.5), fails_at_walls=fails_at_walls).simulator(TASK, 64)
+        world.start(torch.tensor([-5.7, 4.0, 0.0, 0.0]).expand(64, 4), torch.arange(64), torch.zeros(64, 2))
+        world.step(torch.zeros(64, 2))
+        return world
+
+    scattered = beside_a_wall(0.0, fails_at_walls=False)
+    assert torch.equal(scattered.blocked, scattered.state[:, 0] < -5.5) and 0 < scattered.blocked.sum() < 64
+    assert not beside_a_wall(0.0, fails_at_walls=True).blocked.any()
+    pushed = beside_a_wall(-0.5, fails_at_walls=True)
+    assert pushed.blocked.all() and float(pushed.state[:, 0].max()) == pytest.approx(-5.2, abs=0.1)
+    pushed.start(HERE, torch.tensor([3]), torch.zeros(1, 2))
+    assert (~pushed.blocked).nonzero().tolist() == [[3]]
 
 
 INPUTS = torch.tensor([[0.3, -1.2], [2.0, 0.5], [-0.4, 0.1]])
@@ -125,4 +158,7 @@ def test_what_is_drawn_are_forms_at_the_scale_of_the_moment() -> None:
     in_units = made.in_units(INPUTS.repeat(100, 1), drawn)
     nearest = (in_units[:, None] - made.forms).abs().amax(-1)
     assert float(nearest.amin(1).max()) < 1e-5  # all entries are of one form
+    list(made.network.parameters())[-2].zero_()
+    list(made.network.parameters())[-1].fill_(4.0)
+    assert float(made.log_scale(INPUTS).max()) == pytest.approx(2 * math.tanh(2))
     assert set(nearest.argmin(1).tolist()) == {0, 1, 2, 3}

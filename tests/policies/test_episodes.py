@@ -89,6 +89,9 @@ def test_episodes_end_in_success_in_failure_or_with_their_time() -> None:
     assert tipped.outcome.failed == [1.0] * 5 and tipped.outcome.steps == [1] * 5
     late = in_target(CART, lambda goal: driving(-0.5), 5, seed=3)
     assert late.outcome.success == [0.0] * 5 and late.outcome.steps == [CART.objective.horizon] * 5
+    other = in_target(CART, lambda goal: driving(3.5), 5, seed=4)
+    assert torch.equal(late.start_goal["goal"], tipped.start_goal["goal"])
+    assert not torch.equal(other.start_goal["goal"], tipped.start_goal["goal"])
     assert late.filmed.shape == (CART.objective.horizon + 1, 2) and tipped.filmed.shape == (2, 2) and late.rate > 0
 
 
@@ -128,6 +131,8 @@ def test_where_it_is_to_last_an_episode_succeeds_in_its_last_step() -> None:
     world = training_env(replace(CART, objective=Last(horizon=6)), SIMULATION, NO_GROUNDING, num_envs=3)
     found, _ = in_simulator(world, lambda goal: lambda state, goal: torch.full_like(goal, -0.6), 6, seed=0)
     assert found.success == [1.0] * 3 and found.steps == [6] * 3
+    tested = in_target(replace(CART, objective=Last(horizon=6)), lambda goal: driving(0.0), 3, seed=0).outcome
+    assert tested.success == [1.0] * 3 and tested.steps == [6] * 3
 
 
 def constant(command: float, simulation: Simulation = SIMULATION) -> PolicyFile:
@@ -234,6 +239,16 @@ def test_going_on_from_a_saved_state_is_exact(threads: int) -> None:
     other.load_state_dict(saved)
     for values, again in zip(expected, stretch(other, 12, seed=3), strict=True):
         assert torch.equal(values, again)
+
+
+def test_all_episodes_start_from_moments_with_their_goals_where_the_share_is_one() -> None:
+    torch.manual_seed(0)
+    env, (states, goals) = world(share=1.0), recorded()
+    env.reset()
+    saved = env.state_dict()
+    for state, goal in zip(saved["physics"][:, 1:30].float(), saved["goal"], strict=True):
+        found = (states - state).abs().amax(1) < 1e-4
+        assert found.any() and (goals[found] == goal).all()
 
 
 def test_all_of_the_state_is_observed_in_full_and_the_planar_part_otherwise() -> None:

@@ -46,8 +46,9 @@ def test_resuming_gives_the_same_parameters_to_the_bit(memory: int) -> None:
 
 
 @pytest.mark.parametrize("terminates", [False, True])
-def test_running_out_of_time_bootstraps_and_ending_does_not(terminates: bool) -> None:
+def test_running_out_of_time_bootstraps_and_ending_does_not(terminates: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     env = ConstantReward(16, 5.0 if terminates else math.inf)
+    monkeypatch.setattr(env, "observe", lambda: 1.0 + 9.0 * (env.state == 0.0))  # what comes next is seen to be new
     learner = ppo(env, 2, horizon=10**6 if terminates else 5, discount=0.9)
     list(learner.policy.critic.parameters())[-1].data.fill_(3.0)
     rollout = learner._collect()
@@ -120,7 +121,7 @@ def test_a_segment_begins_with_the_memory_that_the_policy_acted_with(monkeypatch
 
     def diverged(batch: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
         batches.append(batch)
-        return torch.zeros(()), torch.tensor(9.0)
+        return torch.zeros(()), torch.tensor(-9.0)
 
     monkeypatch.setattr(learner, "_loss", diverged)
     learner._learn(learner._collect())
