@@ -16,13 +16,13 @@ _FACES = "astra_data.policies.gymnasium"
 _GROUNDED = "astra_data.pipeline.grounded_env"
 
 for _maze, _task, _horizon in (("UMaze", "antmaze-umaze", 700), ("Long", "antmaze-long", 1000)):
-    for _world, _faces in (("AntMaze", "ant_maze"), ("PointMaze", "point_maze")):
+    for _world in ("AntMaze", "PointMaze"):
         gymnasium.register(
             f"astra_data/{_world}{_maze}-v0",
-            entry_point=f"{_FACES}:{_faces}",
-            vector_entry_point=f"{_FACES}:{_faces}_vector",
+            entry_point=f"{_FACES}:maze",
+            vector_entry_point=f"{_FACES}:maze_vector",
             max_episode_steps=_horizon,
-            kwargs={"task": _task},
+            kwargs={"task": _task, "in_target": _world == "AntMaze"},
         )
 
 gymnasium.register(

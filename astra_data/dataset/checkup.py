@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal, Self
 
@@ -257,20 +257,26 @@ def check_up(dataset: Dataset, called: str | None = None) -> Checkup:
     for clock in clocks:
         for episode in dataset.episodes([clock.name]):
             clock.add(episode)
-    found = _of_import(dataset) + [finding for clock in clocks for finding in clock.findings(called)]
+    # What the import said of rates and of rounding, where the dataset is one.
+    notes, topics = (dataset.description.get(key) for key in ("notes", "topics"))
+    noted = [*(notes if isinstance(notes, list) else []), *(topics if isinstance(topics, dict) else [])]
+    advice = "correct the mapping and import again, unless it is meant"
+    found = [Finding("warning", f"at import, {note}", advice) for note in noted]
+    found += [finding for clock in clocks for finding in clock.findings(called)]
     statistics = dataset.statistics()
     ranges = {name: np.array([statistics[name][key] for key in ("min", "max")], np.float64) for name in columns}
-    repeated, torn, motions = list[tuple[int, int]](), dict[int, tuple[int, int]](), list[_Motion]()
+    doubled, torn, motions = list[tuple[int, int]](), dict[int, tuple[int, int]](), list[_Motion]()
     states = [name for name in (STATE, NEXT_STATE) if name in columns]
     for episode in dataset.episodes(states) if STATE in columns else ():
         state = as_rows(episode.columns[STATE])
-        repeated.append(_repeated(state))
+        doubled.append(repeated(state))
         motions.append(_motion(episode.uid, state))
         if NEXT_STATE in columns:
             torn[episode.uid] = _torn(episode)
     if STATE in columns:
-        found += _of_repeats(repeated)
-        found += shift(zip(_rows(dataset, STATE), _rows(dataset, ACTION), strict=True)) if ACTION in columns else []
+        found += repeats(doubled)
+        both = dataset.episodes([STATE, ACTION]) if ACTION in columns else ()
+        found += shift((as_rows(one.columns[STATE]), as_rows(one.columns[ACTION])) for one in both)
         found += large_angles(columns[STATE], np.abs(ranges[STATE]).max(axis=0))
         found += _of_torn(torn) if torn else []
     found += duplicates(dataset.digests, uids, called)
@@ -291,18 +297,6 @@ def check_up(dataset: Dataset, called: str | None = None) -> Checkup:
     rates = [str(clock) for clock in clocks] or [f"{fps} Hz declared; no time column to compare it with"]
     summary = [f"endings: {line}", *summary, *(f"rate: {rate}" for rate in rates)]
     return Checkup(dataset.reference, tuple(summary), tuple(found))
-
-
-def _rows(dataset: Dataset, name: str) -> Iterator[Array]:
-    return (as_rows(episode.columns[name]) for episode in dataset.episodes([name]))
-
-
-def _of_import(dataset: Dataset) -> list[Finding]:
-    """Return what the import said of rates and of rounding, where the dataset is one."""
-    notes, topics = (dataset.description.get(key) for key in ("notes", "topics"))
-    found = [*(notes if isinstance(notes, list) else []), *(topics if isinstance(topics, dict) else [])]
-    advice = "correct the mapping and import again, unless it is meant"
-    return [Finding("warning", f"at import, {note}", advice) for note in found]
 
 
 def edge_shares(actions: Array) -> Floats:
@@ -446,25 +440,21 @@ def endings(
     return line, found
 
 
-def repeats(states: Iterable[Array]) -> list[Finding]:
-    """Tell where many rows repeat the one before to the bit while the robot moves; `states` are (T, S)."""
-    return _of_repeats([*map(_repeated, states)])
-
-
-def _repeated(state: Array) -> tuple[int, int]:
-    """Return how many rows of an episode do, and how many could."""
+def repeated(state: Array) -> tuple[int, int]:
+    """Return how many rows (T, S) repeat the one before to the bit while the robot moves, and how many could."""
     runs = np.diff(np.flatnonzero((state[1:] != state[:-1]).any(axis=1))) - 1
     return int(runs[runs <= MOST_ROWS].sum()), len(state) - 1
 
 
-def _of_repeats(counts: Sequence[tuple[int, int]]) -> list[Finding]:
-    repeated, steps = (sum(each) for each in zip(*counts, strict=True))
+def repeats(counts: Sequence[tuple[int, int]]) -> list[Finding]:
+    """Tell where many rows are `repeated`, of the counts of each episode."""
+    often, steps = (sum(each) for each in zip(*counts, strict=True))
     what = (
-        f"{repeated} of {steps} steps repeat the state of the row before to the bit, between "
+        f"{often} of {steps} steps repeat the state of the row before to the bit, between "
         "steps that move: the log is faster than its sensor, or rows were written twice"
     )
     advice = "leave out the repeated rows, correct `fps`, and import again"
-    return [Finding("warning", what, advice)] if repeated > MOST_REPEATED * steps else []
+    return [Finding("warning", what, advice)] if often > MOST_REPEATED * steps else []
 
 
 def shift(episodes: Iterable[tuple[Array, Array]]) -> list[Finding]:

@@ -15,18 +15,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from astra_data.core.durable import (
-    discard,
-    held,
-    make_folder,
-    move,
-    refuse_existing,
-    remove_empty,
-    sweep,
-    sync,
-    write_file,
-    writing,
-)
+from astra_data.core import durable
 from astra_data.core.errors import AstraDataError, BadInputError, CorruptDatasetError, DiskError, in_short
 from astra_data.dataset import format as layout
 from astra_data.dataset.columns import Column, Episode, Scalar
@@ -97,10 +86,10 @@ class StagedWriter:
                 f"{self.root}: an interrupted recording left {self._left()}; "
                 f"resume it (--resume), or delete {self.folder} to start again."
             )
-        with writing(self.folder), ExitStack() as stack:
-            stack.callback(remove_empty, make_folder(self.folder))
-            sweep(self.root)
-            if not stack.enter_context(held(self.folder)):
+        with durable.writing(self.folder), ExitStack() as stack:
+            stack.callback(durable.remove_empty, durable.make_folder(self.folder))
+            durable.sweep(self.root)
+            if not stack.enter_context(durable.held(self.folder)):
                 raise BadInputError(f"{self.root} is being recorded right now; wait or choose another folder.")
             if self.root.exists():
                 if self._holds_work() and not self._is_written():
@@ -108,8 +97,8 @@ class StagedWriter:
                         f"{self.root} exists already and is another dataset than the interrupted recording, "
                         f"which left {self._left()} in {self.folder}: move one of the two away."
                     )
-                discard(self.folder, self.root)  # a kill came between the dataset and this
-                refuse_existing(self.root)
+                durable.discard(self.folder, self.root)  # a kill came between the dataset and this
+                durable.refuse_existing(self.root)
             self._agree_on_the_settings()
             for path in self._paths():
                 episode = load_staged(path, self._columns)
@@ -139,7 +128,7 @@ class StagedWriter:
             finally:
                 with suppress(OSError):  # what stays is recognized by the next call
                     if is_written or not self._holds_work():
-                        discard(self.folder, self.root)
+                        durable.discard(self.folder, self.root)
 
     @contextmanager
     def _keeping(self) -> Iterator[None]:
@@ -166,16 +155,16 @@ class StagedWriter:
         self._admission.admit(episode, keep=False)
         path = self._path(place)
         partial = path.with_suffix(".partial")
-        with self._keeping(), writing(path):
+        with self._keeping(), durable.writing(path):
             write_staged(partial, episode, self._schema)
-            sync(partial)
-            move(partial, path)
+            durable.sync(partial)
+            durable.move(partial, path)
         self._admission.admit(episode)
         self.staged[place], self.lengths[place] = episode.metadata, len(episode)
 
     def drop(self, position: int) -> None:
         """Leave out the staged episode at `position`; its uid stays taken."""
-        with writing(self._path(position)):
+        with durable.writing(self._path(position)):
             self._path(position).unlink()
         del self.staged[position], self.lengths[position]
 
@@ -227,7 +216,7 @@ class StagedWriter:
                 f"of which recording: delete the folder to start again."
             )
         else:
-            write_file(self.folder / _SETTINGS, json.dumps(self._settings, indent=1, sort_keys=True))
+            durable.write_file(self.folder / _SETTINGS, json.dumps(self._settings, indent=1, sort_keys=True))
 
 
 def write_staged(path: Path, episode: Episode, schema: pa.Schema) -> None:

@@ -1,4 +1,4 @@
-"""Seed torch's global generators of the devices in use, and no others; `torch.manual_seed` seeds all."""
+"""Fits by gradient descent, which can be resumed; seeds of torch's generators."""
 
 import copy
 import math

@@ -12,19 +12,8 @@ from torch.nn.utils.rnn import pad_sequence
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import held_out_episodes
-from astra_data.dataset.columns import (
-    ABSTRACT_NEXT_STATE,
-    ABSTRACT_SIMULATED_NEXT_STATE,
-    ABSTRACT_STATE,
-    ACTION,
-    GOAL,
-    NEXT_STATE,
-    REWARD,
-    STATE,
-    SUCCESS,
-    TERMINATED,
-    Array,
-)
+from astra_data.dataset import columns as names
+from astra_data.dataset.columns import Array
 from astra_data.dataset.compare import recordings_of
 from astra_data.dataset.inspection import stands_still
 from astra_data.dataset.reader import Dataset
@@ -77,7 +66,10 @@ def draw_steps(lengths: Tensor, count: int, length: int) -> tuple[Tensor, Tensor
     return episodes[:, None], steps, (steps >= drawn[:, None]) & (steps < drawn[:, None] + length)
 
 
-_COLUMNS = (*(STATE, ACTION, TERMINATED), *(ABSTRACT_STATE, ABSTRACT_NEXT_STATE, ABSTRACT_SIMULATED_NEXT_STATE))
+_COLUMNS = (
+    *(names.STATE, names.ACTION, names.TERMINATED),
+    *(names.ABSTRACT_STATE, names.ABSTRACT_NEXT_STATE, names.ABSTRACT_SIMULATED_NEXT_STATE),
+)
 
 
 @dataclass(frozen=True)
@@ -106,10 +98,9 @@ class PairedEpisodes:
     def load(cls, root: str | Path, device: str = "cpu") -> "PairedEpisodes":
         """Read the paired dataset at `root`, actions as ±1; a last step that was made up joins the one before."""
         dataset = open_dataset(root)
-        if ABSTRACT_STATE not in dataset.features:
-            raise BadInputError(f"{root} has no column {ABSTRACT_STATE}: expected a dataset that was paired")
-        names = [*_COLUMNS, *({GOAL, REWARD, SUCCESS} & dataset.features.keys())]
-        columns = dataset.columns(names)
+        if names.ABSTRACT_STATE not in dataset.features:
+            raise BadInputError(f"{root} has no column {names.ABSTRACT_STATE}: expected a dataset that was paired")
+        columns = dataset.columns([*_COLUMNS, *({names.GOAL, names.REWARD, names.SUCCESS} & dataset.features.keys())])
         lengths, held_out = dataset.lengths, np.array(dataset.metadata.get("held_out", ()), dtype=bool)
         uids, recordings = dataset.uids, recordings_of(dataset)
         if (made_up := _made_up(dataset, columns)).any():
@@ -126,26 +117,26 @@ class PairedEpisodes:
         padded = {}
         for name, values in columns.items():
             steps = torch.from_numpy(values if values.dtype == bool else values.astype("float32", copy=False))
-            if name not in (REWARD, TERMINATED, SUCCESS):
+            if name not in (names.REWARD, names.TERMINATED, names.SUCCESS):
                 steps = steps.reshape(len(steps), -1)
-            if name == ACTION and commands is not None:
+            if name == names.ACTION and commands is not None:
                 steps = commands.normal(steps)
             padded[name] = pad_sequence(steps.to(device).split(lengths.tolist()), batch_first=True)
         mask = torch.arange(lengths.max(), device=device) < torch.tensor(lengths, device=device)[:, None]
-        action, terminated = padded[ACTION], padded[TERMINATED]
-        reward = padded.get(REWARD, torch.zeros_like(terminated, dtype=action.dtype))
-        failed = terminated & ~padded.get(SUCCESS, terminated)
+        action, terminated = padded[names.ACTION], padded[names.TERMINATED]
+        reward = padded.get(names.REWARD, torch.zeros_like(terminated, dtype=action.dtype))
+        failed = terminated & ~padded.get(names.SUCCESS, terminated)
         return cls(
-            target_state=padded[STATE],
+            target_state=padded[names.STATE],
             reward=reward,
             terminated=terminated,
             windows=PairedWindows(
-                state=padded[ABSTRACT_STATE],
+                state=padded[names.ABSTRACT_STATE],
                 action=action,
                 previous_action=torch.cat([torch.zeros_like(action[:, :1]), action[:, :-1]], dim=1),
-                goal=padded.get(GOAL, action.new_empty(*mask.shape, 0)),
-                simulated_next=padded[ABSTRACT_SIMULATED_NEXT_STATE],
-                next_state=padded[ABSTRACT_NEXT_STATE],
+                goal=padded.get(names.GOAL, action.new_empty(*mask.shape, 0)),
+                simulated_next=padded[names.ABSTRACT_SIMULATED_NEXT_STATE],
+                next_state=padded[names.ABSTRACT_NEXT_STATE],
                 reward=reward,
                 goes_on=(mask & ~terminated).float(),
                 failed=failed.float(),
@@ -154,7 +145,7 @@ class PairedEpisodes:
             ),
             reference=dataset.reference,
             content_hash=dataset.content_hash,
-            has_rewards=REWARD in padded,
+            has_rewards=names.REWARD in padded,
             uids=torch.tensor(uids, device=device),
             recordings=torch.tensor(recordings, device=device),
             held_out=torch.tensor(held_out, device=device) if held_out.any() else None,
@@ -242,12 +233,12 @@ def divided(
 def _made_up(dataset: Dataset, columns: Mapping[str, Array]) -> NDArray[np.bool_]:
     """Return which episodes (E,) end with a terminated step whose next state is its own, to the bit."""
     last = dataset.lengths.cumsum() - 1
-    ended = np.flatnonzero(columns[TERMINATED][last])
+    ended = np.flatnonzero(columns[names.TERMINATED][last])
     made_up = np.zeros(len(dataset), dtype=bool)
-    if NEXT_STATE in dataset.features and len(ended):
-        after = dataset.columns([NEXT_STATE], ended.tolist())[NEXT_STATE]
+    if names.NEXT_STATE in dataset.features and len(ended):
+        after = dataset.columns([names.NEXT_STATE], ended.tolist())[names.NEXT_STATE]
         after = after[dataset.lengths[ended].cumsum() - 1]
-        made_up[ended] = [*map(stands_still, columns[STATE][last[ended]], after)]
+        made_up[ended] = [*map(stands_still, columns[names.STATE][last[ended]], after)]
     return made_up
 
 
@@ -257,7 +248,7 @@ def _merged(
     """Merge the last step of the episodes `merged` (E,) into the one before; return what is left."""
     last = (lengths.cumsum() - 1)[merged & (lengths > 1)]
     left = dict(columns)
-    for name in {REWARD, TERMINATED, SUCCESS} & left.keys():
+    for name in {names.REWARD, names.TERMINATED, names.SUCCESS} & left.keys():
         values = left[name].copy()
         values[last - 1] += values[last]
         left[name] = values
@@ -268,10 +259,10 @@ def _merged(
 
 def _dropped_place(dataset: Dataset) -> tuple[int, ...]:
     columns = {column.name: column for column in dataset.schema}
-    roles = columns[ABSTRACT_STATE].roles
+    roles = columns[names.ABSTRACT_STATE].roles
     if not roles or "position" in dict(roles):
         return ()
-    groups = [group for role, group in columns[STATE].roles if role == "position"]
+    groups = [group for role, group in columns[names.STATE].roles if role == "position"]
     return tuple(index for group in groups for index in range(group.start, group.stop))
 
 

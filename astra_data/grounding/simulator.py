@@ -23,7 +23,10 @@ class EpisodeSimulator:
         """Wrap `simulator`."""
         self.simulator, self.landed = simulator, simulator.state
         self._varied = simulator if isinstance(simulator, VariedSimulator) else None
-        self._remembering = _remembering_within(simulator)
+        inner: object = simulator
+        while hasattr(inner, "simulator"):
+            inner = inner.simulator
+        self._remembering = inner if isinstance(inner, RememberingSimulator) else None
 
     @property
     def state(self) -> Tensor:
@@ -95,13 +98,6 @@ class EpisodeSimulator:
             self._varied.parameters = state["parameters"].clone()
         if self._remembering is not None:
             self._remembering.memory = state["memory"].clone()
-
-
-def _remembering_within(simulator: object) -> RememberingSimulator | None:
-    """Return the innermost simulator if its steps depend on more than its states."""
-    while hasattr(simulator, "simulator"):
-        simulator = simulator.simulator
-    return simulator if isinstance(simulator, RememberingSimulator) else None
 
 
 class Grounding(Protocol):

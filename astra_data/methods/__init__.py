@@ -11,16 +11,7 @@ from astra_data.core.naming import PLUS, base_method, is_plus
 from astra_data.grounding.encoder import ENCODERS
 from astra_data.grounding.files import KINDS, missing_parts
 from astra_data.grounding.fit import HistoryFit
-from astra_data.methods.astra import (
-    ASTRA,
-    ASTRA_PRINTED,
-    ASTRA_TASK_REWARD,
-    ASTRA_WITHOUT_FAILURES,
-    ASTRA_WITHOUT_LATENT,
-    ASTRA_WITHOUT_REWARD,
-    ASTRA_WITHOUT_SCATTER,
-    NAS,
-)
+from astra_data.methods.astra import ABLATIONS, ASTRA, NAS
 from astra_data.methods.baselines import COMPASS, DIRECT_TRANSFER, DOMAIN_RANDOMIZATION, FULL_OBS, TARGET
 from astra_data.methods.follower import FOLLOWER
 from astra_data.methods.iql import BEHAVIOR_CLONING, DIRECT_TRANSFER_IQL, IQL
@@ -45,12 +36,7 @@ METHODS: dict[str, Method] = {
         BEHAVIOR_CLONING,
         DIRECT_TRANSFER_IQL,
         ASTRA,
-        ASTRA_WITHOUT_LATENT,
-        ASTRA_WITHOUT_REWARD,
-        ASTRA_TASK_REWARD,
-        ASTRA_WITHOUT_FAILURES,
-        ASTRA_WITHOUT_SCATTER,
-        ASTRA_PRINTED,
+        *ABLATIONS,
         FOLLOWER,
     )
 }
@@ -82,11 +68,9 @@ def add_method(name: str, place: str) -> None:
         raise BadInputError(f"{place} is a {type(method).__name__}, expected a Method")
     if faults := [*_faults(method)]:
         raise BadInputError("; ".join(f"{place} {fault}" for fault in faults))
-    if kind := method.grounding:
-        owner = KINDS.setdefault(kind.kind, kind)
-        if owner is not kind:
-            whose = f"{owner.__name__} in {owner.__module__}"
-            raise BadInputError(f"{place}: groundings of kind '{kind.kind}' are those of {whose}: rename its kind")
+    if (kind := method.grounding) and (owner := KINDS.setdefault(kind.kind, kind)) is not kind:
+        whose = f"{owner.__name__} in {owner.__module__}"
+        raise BadInputError(f"{place}: groundings of kind '{kind.kind}' are those of {whose}: rename its kind")
     if isinstance(method.fit, HistoryFit):
         encoder = method.fit.encoder
         if ENCODERS.setdefault(encoder.kind, encoder) is not encoder:

@@ -8,7 +8,6 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from astra_data.core.artifact import CHECKPOINT
 from astra_data.core.checkpoint import Logbook
@@ -52,7 +51,7 @@ def learn_from_episodes(training: Training) -> tuple[PolicyFile, dict[str, Any]]
     else:
         policy = copy.deepcopy(training.initial.policy).requires_grad_(True)
     curve = _optimize(Iql(policy, experience, config, seed=training.seed), training)
-    return PolicyFile(policy, None, episodes.reference, episodes.content_hash), curve
+    return training.learned(policy, None), curve
 
 
 def clone_behavior(training: Training) -> tuple[PolicyFile, dict[str, Any]]:
@@ -74,17 +73,16 @@ def experience_of(task: Task, episodes: PairedEpisodes) -> Experience:
     """Return the target's side of `episodes` as a policy sees it, and sines and cosines of the position for critics."""
     windows = episodes.windows
     features = _position_features(task).to(windows.state.device)
-
-    def observation(state: Tensor) -> Tensor:
-        seen = policy_observation(task.objective, state, windows.goal, None)
-        return torch.cat([seen, features(state[..., :2])], dim=-1)
-
+    now, later = (
+        torch.cat([policy_observation(task.objective, state, windows.goal, None), features(state[..., :2])], dim=-1)
+        for state in (windows.state, windows.next_state)
+    )
     return Experience(
-        observation=observation(windows.state),
+        observation=now,
         previous_action=windows.previous_action,
         action=windows.action,
         reward=episodes.reward,
-        next_observation=observation(windows.next_state),
+        next_observation=later,
         terminated=episodes.terminated,
         lengths=episodes.lengths,
     )
@@ -115,18 +113,10 @@ IQL = Method(
     learns_from="episodes",
     table=Table("iql", IqlConfig),
 )
-
 BEHAVIOR_CLONING = replace(
     IQL, name="behavior_cloning", title="Behavior cloning", color="#AA4499", learn=clone_behavior
 )
-
-DIRECT_TRANSFER_IQL = Method(
-    name="direct_transfer_iql",
-    title="Direct transfer + IQL",
-    color="#7B3294",
-    learn=learn_from_episodes,
-    learns_from="episodes",
-    initial="direct_transfer",
-    table=Table("iql", IqlConfig),
+DIRECT_TRANSFER_IQL = replace(
+    IQL, name="direct_transfer_iql", title="Direct transfer + IQL", color="#7B3294", initial="direct_transfer"
 )
 """Fits the critics while the policy is left as it is; then fine-tunes direct transfer's policy, gently."""

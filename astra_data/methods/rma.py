@@ -49,8 +49,7 @@ class TeacherThenStudent(InSimulator):
         curve["adaptation"] = optimize(adaptation, env, phase_2, f"adaptation_{CHECKPOINT}")
         for clock in CLOCKS:
             curve[clock] += curve["adaptation"][clock]
-        episodes = training.episodes
-        return PolicyFile(adaptation.student, simulation, episodes.reference, episodes.content_hash), curve
+        return training.learned(adaptation.student, simulation), curve
 
 
 RMA = Method(

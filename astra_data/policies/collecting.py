@@ -17,19 +17,8 @@ from astra_data.core.config import NotNegative, in_order
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress
 from astra_data.core.seeding import derive, generator
-from astra_data.dataset.columns import (
-    ACTION,
-    DONE,
-    GOAL,
-    NEXT_STATE,
-    REWARD,
-    STATE,
-    SUCCESS,
-    TERMINATED,
-    TRUNCATED,
-    Array,
-    Episode,
-)
+from astra_data.dataset import columns as names
+from astra_data.dataset.columns import Array, Episode
 from astra_data.dataset.inspection import outcome_of
 from astra_data.dataset.staging import StagedWriter
 from astra_data.policies.episodes import ObservedTargetEnv
@@ -104,18 +93,14 @@ class RandomCommands:
         if self._watch is not None:
             over |= self._watch.clearance(state, self._command[:, None])[:, 0] < self._watch.clearance_m
         due = np.flatnonzero(over)
-        self._command[due] = self._drawn(state, due)
+        choices, chosen = self._proposed(due, 1 if self._watch is None else _CHOICES), np.zeros(len(due), dtype=int)
+        if self._watch is not None:  # the first that stays clear of walls, or the clearest
+            clearance = self._watch.clearance(state[due], choices)
+            chosen = clearance.clip(max=self._watch.clearance_m).argmax(axis=1)
+        self._command[due] = choices[np.arange(len(due)), chosen]
         self._left[due] = self._times(len(due))
         self._left -= 1
         return torch.from_numpy(self._command).float()
-
-    def _drawn(self, state: Tensor, due: NDArray[np.intp]) -> NDArray[np.float64]:
-        """Draw commands (n, A) for robots `due` (n,); with a watch, the first of 16 clear of walls, or the clearest."""
-        if self._watch is None:
-            return self._proposed(due, 1)[:, 0]
-        choices = self._proposed(due, _CHOICES)
-        clearance = self._watch.clearance(state[due], choices).clip(max=self._watch.clearance_m)
-        return np.asarray(choices[np.arange(len(due)), clearance.argmax(axis=1)])
 
     def _proposed(self, due: NDArray[np.intp], choices: int) -> NDArray[np.float64]:
         """Draw `choices` commands (n, K, A) for each of the robots `due` (n,)."""
@@ -193,42 +178,36 @@ def record(
     active, began = torch.ones(len(rows), dtype=torch.bool), time.perf_counter()
     columns, steps = dict[str, Array](), 0
     for step in range(max_steps):
-        row = _step(env, behavior, active, last=step == max_steps - 1)
-        row[ACTION] = task.limits.in_units(row[ACTION])
-        row[SUCCESS] = task.objective.succeeded(row[SUCCESS], row[TERMINATED] & ~row[SUCCESS], step + 1)
+        state, goal = env.state, env.goal.clone()
+        action = behavior.act(state, goal)
+        outcome = env.step(action, active)
+        ended = outcome.terminated
+        truncated = torch.full_like(ended, step == max_steps - 1) & ~ended
+        row = ({names.GOAL: goal} if goal.shape[1] else {}) | {
+            names.STATE: state,
+            names.ACTION: task.limits.in_units(action),
+            names.NEXT_STATE: env.state,
+            names.REWARD: outcome.reward,
+            names.TERMINATED: ended,
+            names.TRUNCATED: truncated,
+            names.DONE: ended | truncated,
+            names.SUCCESS: task.objective.succeeded(outcome.success, ended & ~outcome.success, step + 1),
+        }
         for name, values in row.items():
             if name not in columns:
                 columns[name] = np.empty((max_steps, *values.shape), values.numpy().dtype)
             columns[name][step] = values.numpy()
         steps += int(active.sum())
-        for index in torch.nonzero(active & row[DONE]).squeeze(1).tolist():
+        for index in torch.nonzero(active & row[names.DONE]).squeeze(1).tolist():
             if rows[index] not in writer.staged:
                 episode = {name: as_column(values[: step + 1, index]) for name, values in columns.items()}
                 writer.add(Episode(rows[index], episode, outcome_of(episode) | {"seed": seed}), rows[index])
-        active &= ~row[DONE]
+        active &= ~row[names.DONE]
         rate = steps / (time.perf_counter() - began)
         progress((step + 1) / max_steps, f"{rate:,.0f} target steps/s")
         if not active.any():
             break
     return steps
-
-
-def _step(env: TargetEnv, behavior: Behavior, active: Tensor, *, last: bool) -> dict[str, Tensor]:
-    state, goal = env.state, env.goal.clone()
-    action = behavior.act(state, goal)
-    outcome = env.step(action, active)
-    truncated = torch.full_like(outcome.terminated, last) & ~outcome.terminated
-    goals = {GOAL: goal} if goal.shape[1] else {}
-    return goals | {
-        STATE: state,
-        ACTION: action,
-        NEXT_STATE: env.state,
-        REWARD: outcome.reward,
-        TERMINATED: outcome.terminated,
-        TRUNCATED: truncated,
-        DONE: outcome.terminated | truncated,
-        SUCCESS: outcome.success,
-    }
 
 
 _PPO_ENVS = 128
@@ -237,6 +216,8 @@ _SAC_ENVS = 32  # target environments stepped side by side
 _SAC = SacConfig(buffer_size=1_000_000)  # settings with which the humanoid learns to stay up; its rewards are 5 a step
 _SAC_SIZES = (256, 256)  # hidden layers of actor and critics
 
+type Judge = Callable[[Mapping[str, float]], tuple[float, str]]
+"""Given the figures of an iteration, returns the share done and a note."""
 type Metadata = dict[str, Any]
 """What a dataset records about the behavior."""
 
@@ -250,12 +231,8 @@ def suboptimal_by_ppo(
     torch.manual_seed(derive(seed, "suboptimal policy"))
     world = ObservedTargetEnv(task, _PPO_ENVS, num_threads=num_threads)
     policy = ActorCritic(ActorCriticShape(world.observation_size, world.action_size))
-    config = PpoConfig(total_steps=steps)
-    ppo = Ppo(world, policy, config, horizon=task.objective.horizon, seed=seed)
-
-    def judge(figures: Mapping[str, float]) -> tuple[float, str]:
-        return ppo.steps / steps, f"reward per step {figures['reward']:.3f}"
-
+    ppo = Ppo(world, policy, PpoConfig(total_steps=steps), horizon=task.objective.horizon, seed=seed)
+    judge: Judge = lambda figures: (ppo.steps / steps, f"reward per step {figures['reward']:.3f}")  # noqa: E731
     return _trained(ppo, world, judge, folder, progress, "abstract")
 
 
@@ -282,7 +259,7 @@ def suboptimal_by_sac(
 def _trained(
     learner: Ppo | Sac,
     world: ObservedTargetEnv,
-    judge: Callable[[Mapping[str, float]], tuple[float, str]],
+    judge: Judge,
     folder: Path,
     progress: Progress,
     observed: Observed,

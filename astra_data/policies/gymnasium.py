@@ -126,23 +126,19 @@ class BatchedVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
         step = self.env.step(torch.tensor(actions, dtype=torch.float32))
         self._age += 1
         truncated = self._age >= self.max_episode_steps
-        observation, infos = self._restart(step, step.terminated | truncated)
-        rewards = step.reward.numpy().astype(np.float64)
-        return observation, rewards, step.terminated.numpy(), truncated.numpy(), infos
-
-    def _restart(self, step: Step, done: Tensor) -> tuple[Array, dict[str, Any]]:
-        facts, ended = _facts(self.env, step), done.numpy()
+        done, facts, observation = step.terminated | truncated, _facts(self.env, step), step.observation
+        ended = done.numpy()
         infos = _info({name: values & ~ended for name, values in facts.items()}, np.ones_like(ended))
-        if not ended.any():
-            return step.observation.numpy(), infos
-        final = np.full(self.num_envs, None, dtype=object)
-        for row in np.flatnonzero(ended):
-            final[row] = step.observation[row].numpy()
-        infos |= {"final_obs": final, "_final_obs": ended}
-        final_info = _info({name: values & ended for name, values in facts.items()}, ended)
-        infos |= {"final_info": final_info, "_final_info": ended}
-        self._age[done] = 0
-        return self.env.reset(done).numpy(), infos
+        if ended.any():
+            final = np.full(self.num_envs, None, dtype=object)
+            for row in np.flatnonzero(ended):
+                final[row] = observation[row].numpy()
+            final_info = _info({name: values & ended for name, values in facts.items()}, ended)
+            infos |= {"final_obs": final, "_final_obs": ended, "final_info": final_info, "_final_info": ended}
+            self._age[done] = 0
+            observation = self.env.reset(done)
+        rewards = step.reward.numpy().astype(np.float64)
+        return observation.numpy(), rewards, step.terminated.numpy(), truncated.numpy(), infos
 
 
 _FACTS = ("success", "failed", "wall_contact")
@@ -163,30 +159,21 @@ def _spaces(env: SeededEnv) -> tuple[Box, Box]:
     return observation, Box(-1.0, 1.0, (env.action_size,), np.float32)
 
 
-def ant_maze(task: str, **options: Any) -> SingleEnv:
-    """Build one target environment of `task`; `options` as for `AntMazeEnv`."""
-    return SingleEnv(task_named(task).target(1, seed=fresh_seed(), **options))
+def maze(task: str, **options: Any) -> SingleEnv:
+    """Build one environment of `task`, `in_target` or abstract; `options` as for `AntMazeEnv`."""
+    return SingleEnv(_mazes(task, 1, **options))
 
 
-def ant_maze_vector(num_envs: int, task: str, max_episode_steps: int, **options: Any) -> BatchedVectorEnv:
-    """Build `num_envs` target environments of `task`; `options` as for `AntMazeEnv`."""
-    env = task_named(task).target(num_envs, seed=fresh_seed(), **options)
-    return BatchedVectorEnv(env, max_episode_steps)
+def maze_vector(num_envs: int, task: str, max_episode_steps: int, **options: Any) -> BatchedVectorEnv:
+    """Build `num_envs` environments as `maze` does."""
+    return BatchedVectorEnv(_mazes(task, num_envs, **options), max_episode_steps)
 
 
-def point_maze(task: str) -> SingleEnv:
-    """Build one abstract environment of `task`."""
-    return SingleEnv(_abstract(task, 1))
-
-
-def point_maze_vector(num_envs: int, task: str, max_episode_steps: int) -> BatchedVectorEnv:
-    """Build `num_envs` abstract environments of `task`."""
-    return BatchedVectorEnv(_abstract(task, num_envs), max_episode_steps)
-
-
-def _abstract(task: str, num_envs: int) -> SeededSimulatorEnv:
-    found = task_named(task)
-    return SeededSimulatorEnv(SimulatorEnv(found.objective, NO_GROUNDING.simulator(found, num_envs)))
+def _mazes(name: str, num_envs: int, *, in_target: bool, **options: Any) -> SeededEnv:
+    task = task_named(name)
+    if in_target:
+        return task.target(num_envs, seed=fresh_seed(), **options)
+    return SeededSimulatorEnv(SimulatorEnv(task.objective, NO_GROUNDING.simulator(task, num_envs, **options)))
 
 
 _POINTS = 50  # of a learning curve

@@ -10,20 +10,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from astra_data.core.checkpoint import as_part, part_of, save_tensors, understood
+from astra_data.core.checkpoint import as_part, loaded, part_of, save_tensors, understood
 from astra_data.core.errors import BadInputError
 from astra_data.grounding.alignment import TargetEncoder
 from astra_data.grounding.encoder import LatentEncoder
 from astra_data.grounding.simulator import NO_GROUNDING, Grounding
-from astra_data.policies.networks import (
-    ActorCritic,
-    ActorCriticShape,
-    AdaptiveShape,
-    Policy,
-    PolicyShape,
-    SoftActor,
-    Student,
-)
+from astra_data.policies import networks
+from astra_data.policies.networks import Policy, PolicyShape
 from astra_data.policies.simulator_env import Simulation, WorldConfig, policy_observation
 from astra_data.worlds.objective import NO_LIMIT
 from astra_data.worlds.task import Task
@@ -200,9 +193,9 @@ class RunningPolicy:
 
 POLICY = "policy.safetensors"  # name of the file of its artifact
 _KINDS: dict[str, tuple[type[Policy], type[PolicyShape]]] = {
-    "actor_critic": (ActorCritic, ActorCriticShape),
-    "adaptive": (Student, AdaptiveShape),
-    "soft_actor": (SoftActor, PolicyShape),
+    "actor_critic": (networks.ActorCritic, networks.ActorCriticShape),
+    "adaptive": (networks.Student, networks.AdaptiveShape),
+    "soft_actor": (networks.SoftActor, PolicyShape),
 }
 _PART = "policy"  # of the tensors of a file: the policy's networks
 
@@ -227,70 +220,51 @@ class PolicyFile:
 
     def save(self, path: Path) -> None:
         """Write the policy to `path`."""
-        kind, networks, own = _taken_apart(self.policy)
-        metadata = own | {"kind": kind, "shape": asdict(self.policy.shape), "dataset": self.dataset}
+        policy = self.policy
+        metadata: dict[str, Any] = {"shape": asdict(policy.shape), "dataset": self.dataset}
         metadata |= {"hash": self.content_hash, "observed": self.observed}
+        if isinstance(policy, UserPolicy):
+            saved: Any = policy.acting
+            weights, metadata["own"] = parts_of(saved)
+            metadata["kind"] = saved.kind
+        else:
+            weights, kinds = policy.state_dict(), {made: kind for kind, (made, _) in _KINDS.items()}
+            if type(policy) not in kinds:
+                known = f"a {', '.join(made.__name__ for made in kinds)}, or what an UserLearner learns"
+                raise BadInputError(f"a {type(policy).__name__} cannot be read again: expected {known}")
+            metadata["kind"] = kinds[type(policy)]
         if self.simulation:
             world, variation = self.simulation.world, self.simulation.variation
-            parts = {"world": world.model_dump(mode="json"), "variation": variation and variation.model_dump()}
-            metadata["simulation"] = parts
-        save_tensors(path, as_part(networks, _PART), metadata)
+            written = {"world": world.model_dump(mode="json"), "variation": variation and variation.model_dump()}
+            metadata["simulation"] = written
+        save_tensors(path, as_part(weights, _PART), metadata)
 
     @classmethod
     def load(cls, path: Path | str, device: str = "cpu") -> "PolicyFile":
         """Read a policy; its parameters are frozen."""
         with understood(Path(path), "a policy", {**_KINDS, **KINDS}, device) as (tensors, metadata):
-            policy = _put_together(part_of(tensors, _PART), metadata)
-            simulation = None
+            weights, simulation = part_of(tensors, _PART), None
+            shape = metadata["shape"] | {"hidden_sizes": tuple(metadata["shape"]["hidden_sizes"])}
+            if "own" in metadata:
+                acting = restored(KINDS[metadata["kind"]], weights, metadata["own"])
+                policy: Policy = UserPolicy(acting, shape["observation_size"], shape["action_size"])
+            else:
+                made, shaped = _KINDS[metadata["kind"]]
+                policy = loaded(made(shaped(**shape)), weights, device)
             if recorded := metadata.get("simulation"):
                 variation = recorded["variation"]
                 simulation = Simulation(
                     WorldConfig(**recorded["world"]), Variation.of_json(variation) if variation else None
                 )
-            read = cls(policy, simulation, metadata["dataset"], metadata["hash"], metadata["observed"])
-        policy.to(device).requires_grad_(False)
-        return read
-
-
-def _taken_apart(policy: Policy) -> tuple[str, Mapping[str, Tensor], dict[str, Any]]:
-    """Return the kind of a policy, its tensors, and metadata if it is of another learner."""
-    if not isinstance(policy, UserPolicy):
-        kinds = {made: kind for kind, (made, _) in _KINDS.items()}
-        if type(policy) not in kinds:
-            known = ", ".join(made.__name__ for made in kinds)
-            raise BadInputError(
-                f"a {type(policy).__name__} cannot be read again: expected a {known}, or what an UserLearner learns"
-            )
-        return kinds[type(policy)], policy.state_dict(), {}
-    saved: Any = policy.acting
-    tensors, metadata = parts_of(saved)
-    return saved.kind, tensors, {"own": metadata}
-
-
-def _put_together(tensors: dict[str, Tensor], metadata: dict[str, Any]) -> Policy:
-    shape = metadata["shape"] | {"hidden_sizes": tuple(metadata["shape"]["hidden_sizes"])}
-    if "own" in metadata:
-        acting = restored(KINDS[metadata["kind"]], tensors, metadata["own"])
-        return UserPolicy(acting, shape["observation_size"], shape["action_size"])
-    made, shaped = _KINDS[metadata["kind"]]
-    policy = made(shaped(**shape))
-    policy.load_state_dict(tensors)
-    return policy
+            return cls(policy, simulation, metadata["dataset"], metadata["hash"], metadata["observed"])
 
 
 def running(
     task: Task, trained: PolicyFile, grounding: Grounding = NO_GROUNDING, target_encoder: TargetEncoder | None = None
 ) -> RunningPolicy:
     """Return the policy, ready to be started; latents, if any, come from ψ^t, or without it from ψ^s."""
-    world = trained.simulation.world if trained.simulation else WorldConfig()
-    made = RunningPolicy(
-        task,
-        trained.policy,
-        grounding.encoder,
-        target_encoder,
-        command_limit=world.command_limit,
-        observed=trained.observed,
-    )
+    limit = trained.simulation.world.command_limit if trained.simulation else NO_LIMIT
+    made = RunningPolicy(task, trained.policy, grounding.encoder, target_encoder, limit, trained.observed)
     if made.observation_size != (taken := trained.policy.shape.observation_size):
         raise BadInputError(
             f"the policy takes {taken} values, {task.name} gives {made.observation_size}: expected a "

@@ -4,12 +4,12 @@ import math
 import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import torch
 from pydantic import Discriminator, Tag
-from torch import Tensor
 
 from astra_data.core.artifact import CHECKPOINT
 from astra_data.core.checkpoint import Logbook
@@ -36,7 +36,6 @@ from astra_data.policies.simulator_env import (
     plus,
     training_env,
 )
-from astra_data.worlds.protocols import BatchedEnv
 from astra_data.worlds.task import Task
 from astra_data.worlds.variation import Variation
 
@@ -81,9 +80,8 @@ class SacTrainConfig(TrainConfig, SacConfig):
 
 def _learner(settings: object) -> str:
     """Return the tag of the model below that `settings` are for; by default PPO."""
-    if isinstance(settings, Mapping):
-        return choice(str(settings.get("learner", "ppo")))
-    return choice(str(getattr(settings, "learner", "ppo")))
+    known = settings.get("learner", "ppo") if isinstance(settings, Mapping) else getattr(settings, "learner", "ppo")
+    return choice(str(known))
 
 
 AnyTrainConfig = Annotated[
@@ -115,22 +113,13 @@ class Training:
         """Steps after which simulated episodes are cut off."""
         return self.config.episode_steps or self.task.objective.horizon
 
+    def learned(self, policy: Policy, simulation: Simulation | None, observed: Observed = "abstract") -> PolicyFile:
+        """Return the policy as learned from the episodes, in the simulator of a `simulation`, if in one."""
+        return PolicyFile(policy, simulation, self.episodes.reference, self.episodes.content_hash, observed)
+
 
 Learn = Callable[[Training], tuple[PolicyFile, dict[str, Any]]]  # returns the policy and its learning curve
-
-
-class ResumableEnv(BatchedEnv, Protocol):
-    """A batched environment in which a training can be resumed."""
-
-    penalty_scale: float  # factor on penalties in the reward, which the training ramps up
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """Return all that `load_state_dict` needs to continue from here."""
-        ...
-
-    def load_state_dict(self, state: dict[str, Tensor]) -> Tensor:
-        """Continue from `state`; return the observations (B, O)."""
-        ...
+TrainingEnv = SimulatorEnv | ObservedTargetEnv
 
 
 @dataclass(frozen=True)
@@ -146,9 +135,8 @@ class InSimulator:
         """Return the policy and its learning curve."""
         env, simulation = self.world(training)
         memory_size = 0 if env.simulator.latent_size else training.config.memory_size
-        episodes = training.episodes
         policy, curve = train_in(env, training.config, memory_size, training, training.simulated_steps)
-        return PolicyFile(policy, simulation, episodes.reference, episodes.content_hash), curve
+        return training.learned(policy, simulation), curve
 
     def world(self, training: Training, *, shows_parameters: bool = False) -> tuple[SimulatorEnv, Simulation]:
         """Return the environment to train in, and what a policy file records about it."""
@@ -161,35 +149,28 @@ class InSimulator:
         variation = settings if isinstance(settings, Variation) else usual
         starts = data_starts(task, world, episodes, grounding)
         simulation = Simulation(world, variation)
-        env = training_env(
-            task,
-            simulation,
-            grounding,
-            num_envs=config.num_envs,
-            device=training.device,
-            starts=starts,
-            shows_parameters=shows_parameters,
-        )
-        return env, simulation
+        make = partial(training_env, task, simulation, grounding, num_envs=config.num_envs, device=training.device)
+        return make(starts=starts, shows_parameters=shows_parameters), simulation
 
 
 def train_in(
-    env: ResumableEnv, config: PpoTrainConfig | SacTrainConfig, memory_size: int, training: Training, horizon: int
+    env: TrainingEnv, config: PpoTrainConfig | SacTrainConfig, memory_size: int, training: Training, horizon: int
 ) -> tuple[Policy, dict[str, Any]]:
     """Train a new policy in `env`, of episodes of at most `horizon` steps; return it and its learning curve."""
     torch.manual_seed(derive(training.seed, "policy"))
     shape = PolicyShape(env.observation_size, env.action_size, memory_size, hidden_sizes=config.hidden_sizes)
-    device, options = training.device, {"horizon": horizon, "seed": training.seed}
+    options = {"horizon": horizon, "seed": training.seed}
     learner: Ppo | Sac
     if isinstance(config, SacTrainConfig):
-        learner = Sac(env, SoftActor(shape).to(device), config, **options)
+        learner = Sac(env, SoftActor(shape).to(training.device), config, **options)
     else:
-        learner = Ppo(env, ActorCritic(ActorCriticShape(**asdict(shape))).to(device), config, **options)
+        policy = ActorCritic(ActorCriticShape(**asdict(shape))).to(training.device)
+        learner = Ppo(env, policy, config, **options)
     return learner.policy, optimize(learner, env, training)
 
 
 def optimize(
-    learner: Learner, env: ResumableEnv, training: Training, checkpoint_name: str = CHECKPOINT
+    learner: Learner, env: TrainingEnv, training: Training, checkpoint_name: str = CHECKPOINT
 ) -> dict[str, Any]:
     """Train to the end, or on from the checkpoint; return the curve. A mastered simulator quickens what is left."""
 
@@ -257,7 +238,7 @@ class InTarget:
             num_threads=training.num_threads,
         )
         policy, curve = train_in(env, config, config.memory_size, training, training.task.objective.horizon)
-        return PolicyFile(policy, None, episodes.reference, episodes.content_hash, self.observed), curve
+        return training.learned(policy, None, self.observed), curve
 
 
 def with_restarts(learn: Learn, training: Training, grounding_file: Path | None) -> tuple[PolicyFile, dict[str, Any]]:
@@ -267,11 +248,14 @@ def with_restarts(learn: Learn, training: Training, grounding_file: Path | None)
         return learn(training)
     grounding = training.grounding if training.device == "cpu" else grounding_at(grounding_file)
     seeds = [training.seed, *(derive(training.seed, f"try {number}") for number in range(1, config.tries))]
-    for number, seed in enumerate(seeds):
-        attempt = _attempt(training, seed, number)
-        policy, curve = learn(attempt)
-        policy.save(attempt.folder / POLICY)
-        saved = PolicyFile.load(attempt.folder / POLICY)
+    for number, seed in enumerate(seeds):  # the first is the training that there would be without tries
+        folder = training.folder / (f"try_{number}" if number else "")
+        folder.mkdir(exist_ok=True)
+        share = part(training.progress, number / config.tries, (number + 1) / config.tries)
+        noted = partial(_noted, share, f"try {number + 1} of {config.tries}")
+        policy, curve = learn(replace(training, seed=seed, folder=folder, progress=noted))
+        policy.save(folder / POLICY)
+        saved = PolicyFile.load(folder / POLICY)
         made.append((reached_in_own_world(training.task, saved, grounding, training.seed), policy, curve))
         if made[-1][0].success >= config.least_success:
             break
@@ -286,16 +270,8 @@ def with_restarts(learn: Learn, training: Training, grounding_file: Path | None)
     return policy, curve | spent | {"tries": tries}
 
 
-def _attempt(training: Training, seed: int, number: int) -> Training:
-    """Return the training of a try; the first is the one that there would be without tries."""
-    tries, folder = training.config.tries, training.folder / (f"try_{number}" if number else "")
-    folder.mkdir(exist_ok=True)
-    share = part(training.progress, number / tries, (number + 1) / tries)
-
-    def progress(fraction: float, note: str) -> None:
-        share(fraction, f"try {number + 1} of {tries}  {note}")
-
-    return replace(training, seed=seed, folder=folder, progress=progress)
+def _noted(progress: Progress, which: str, share: float, note: str) -> None:
+    progress(share, f"{which}  {note}")
 
 
 if TYPE_CHECKING:
@@ -328,6 +304,4 @@ class UserLearner(InSimulator):
             raise BadInputError(f"learn returned a {type(learned).__name__}, expected a {self.policy.__name__}")
         watched.finish()
         own = UserPolicy(learned, env.observation_size, env.action_size)
-        episodes = training.episodes
-        curve = {"points": watched.points}
-        return PolicyFile(own, simulation, episodes.reference, episodes.content_hash), curve
+        return training.learned(own, simulation), {"points": watched.points}

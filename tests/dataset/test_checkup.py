@@ -22,6 +22,7 @@ from astra_data.dataset.checkup import (
     is_angle,
     is_clock,
     longest_rests,
+    repeated,
     repeats,
     shift,
 )
@@ -168,7 +169,7 @@ WALK = np.cumsum(np.random.default_rng(0).normal(size=(400, 2)), axis=0)
     ],
 )
 def test_rows_that_were_written_twice_are_found(state: Array, found: bool) -> None:
-    assert bool(repeats([state[:200], state[200:]])) is found
+    assert bool(repeats([repeated(state[:200]), repeated(state[200:])])) is found
 
 
 def shifted(state: Floats, action: Floats) -> list[Finding]:

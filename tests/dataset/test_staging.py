@@ -135,8 +135,7 @@ def test_what_was_prepared_is_kept_after_an_error_and_lost_to_no_other_dataset(t
 
 def test_an_episode_is_on_the_disk_itself_before_it_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     synced: list[str] = []
-    for module in ("dataset.staging", "core.durable"):
-        monkeypatch.setattr(f"astra_data.{module}.sync", lambda path: synced.append(path.name))
+    monkeypatch.setattr("astra_data.core.durable.sync", lambda path: synced.append(path.name))
     with staged_writer(tmp_path / "new" / "set") as writer:
         assert {tmp_path.name, "new", "plan.json", ".set.staged"} <= {*synced}
         synced.clear()

@@ -2,7 +2,7 @@ import numpy as np
 import torch
 
 from astra_data.grounding.simulator import EpisodeSimulator
-from astra_data.methods.follower import CarefulFollower, careful
+from astra_data.methods.follower import careful
 from astra_data.policies.simulator_env import SimulatorEnv
 from astra_data.robots.registry import TASKS
 
@@ -15,12 +15,11 @@ def test_the_follower_reaches_the_goal_and_keeps_away_from_the_walls() -> None:
     simulator = task.simulator(3)
     start = torch.from_numpy(navigation.draw_starts(rng, 3)).float()
     simulator.reset_to(torch.cat([start, torch.zeros(3, 2)], dim=-1))
-    follower = CarefulFollower(maze)
-    fields = follower.fields(goal)
+    act = careful(task, goal)
     reached = torch.zeros(3, dtype=torch.bool)
     closest = np.inf
     for _ in range(navigation.horizon):
-        command = follower.command(simulator.state[:, :2], goal, fields)
+        command = act(simulator.state, goal)
         assert command.abs().max() <= 1.0 + 1e-6
         place = simulator.step(command)[:, :2]
         reached |= navigation.reached(place, goal)

@@ -19,7 +19,6 @@ from astra_data.policies.collecting import (
     RandomCommands,
     StressCommands,
     WallWatch,
-    _step,
     record,
     suboptimal_by_ppo,
     suboptimal_by_sac,
@@ -122,14 +121,19 @@ def test_an_episode_that_ends_in_its_last_step_is_terminated_and_not_truncated()
         state=torch.zeros(2, 3),
         goal=torch.zeros(2, 2),
         step=lambda action, active: SimpleNamespace(
-            reward=torch.zeros(2), terminated=ends, success=torch.zeros(2, dtype=torch.bool)
+            reward=torch.zeros(2), terminated=ends.clone(), success=torch.zeros(2, dtype=torch.bool)
         ),
     )
-    behavior: Any = SimpleNamespace(act=lambda state, goal: torch.zeros(2, 2))
-    for last, truncated in ((True, ~ends), (False, torch.zeros(2, dtype=torch.bool))):
-        row = _step(env, behavior, ends, last=last)
-        assert torch.equal(row[TERMINATED], ends) and torch.equal(row[TRUNCATED], truncated)
-        assert torch.equal(row[DONE], ends | truncated)
+    behavior: Any = SimpleNamespace(act=lambda state, goal: torch.zeros(2, CART.action.size))
+    recorded = dict[int, Episode]()
+    writer: Any = SimpleNamespace(staged=set(), add=lambda episode, number: recorded.update({number: episode}))
+    assert record(CART, env, behavior, range(2), writer, max_steps=2, seed=0, progress=silent) == 3
+    assert [recorded[0].columns[name].tolist() for name in (TERMINATED, TRUNCATED, DONE)] == [[True], [False], [True]]
+    assert [recorded[1].columns[name].tolist() for name in (TERMINATED, TRUNCATED)] == [[False] * 2, [False, True]]
+    assert recorded[1].columns[DONE].tolist() == [False, True]
+    ends.fill_(True)
+    record(CART, env, behavior, range(2), writer, max_steps=1, seed=0, progress=silent)
+    assert [recorded[1].columns[name].tolist() for name in (TERMINATED, TRUNCATED, DONE)] == [[True], [False], [True]]
 
 
 MAZE, WALKER = TASKS["antmaze-umaze"], TASKS["humanoid-kinematics"]

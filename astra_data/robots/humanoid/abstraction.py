@@ -79,17 +79,8 @@ def _skeleton(dtype: torch.dtype, device: torch.device) -> _Skeleton:
     )
 
 
-class _Placed(NamedTuple):
-    """Positions of the parts of a humanoid."""
-
-    mass: Tensor  # center of mass, (..., 3)
-    centers: Tensor  # those of the bodies, (..., 13, 3)
-    feet: Tensor  # (..., 2, 3)
-    axes: Tensor  # of the joints, (..., 17, 3)
-    anchors: Tensor  # points on them, (..., 17, 3)
-
-
-def _place(joints: Tensor) -> _Placed:
+def _place(joints: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return centers of mass of the bodies (..., 13, 3), feet (..., 2, 3), joints' axes and anchors (..., 17, 3)."""
     skeleton = _skeleton(joints.dtype, joints.device)
     identity = torch.eye(3, dtype=joints.dtype, device=joints.device)
     angle = joints[..., None, None]
@@ -113,26 +104,22 @@ def _place(joints: Tensor) -> _Placed:
         return origin + turn @ point
 
     centers = torch.stack([place(body, center) for body, center in skeleton.centers.items()], dim=-2)
-    return _Placed(
-        mass=skeleton.shares @ centers,
-        centers=centers,
-        feet=torch.stack([place(body, center) for body, center in skeleton.feet], dim=-2),
-        axes=torch.stack(axes, dim=-2),
-        anchors=torch.stack(anchors, dim=-2),
-    )
+    feet = torch.stack([place(body, center) for body, center in skeleton.feet], dim=-2)
+    return centers, feet, torch.stack(axes, dim=-2), torch.stack(anchors, dim=-2)
 
 
 def mass_and_feet(joints: Tensor) -> tuple[Tensor, Tensor]:
     """Return center of mass (..., 3), left and right foot (..., 2, 3) in the torso's frame, of angles (..., 17)."""
-    placed = _place(joints)
-    return placed.mass, placed.feet
+    centers, feet, _, _ = _place(joints)
+    return _skeleton(joints.dtype, joints.device).shares @ centers, feet
 
 
 def mass_velocity(joints: Tensor, rates: Tensor) -> Tensor:
     """Return the center of mass's velocity (..., 3) in m/s relative to the torso, of angles and rates (..., 17)."""
-    placed, skeleton = _place(joints), _skeleton(joints.dtype, joints.device)
-    lever = skeleton.moved @ placed.centers - skeleton.moved.sum(-1, keepdim=True) * placed.anchors
-    velocity: Tensor = (rates.unsqueeze(-1) * torch.linalg.cross(placed.axes, lever)).sum(-2)
+    centers, _, axes, anchors = _place(joints)
+    moved = _skeleton(joints.dtype, joints.device).moved
+    lever = moved @ centers - moved.sum(-1, keepdim=True) * anchors
+    velocity: Tensor = (rates.unsqueeze(-1) * torch.linalg.cross(axes, lever)).sum(-2)
     return velocity
 
 

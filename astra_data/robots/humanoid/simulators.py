@@ -11,13 +11,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from astra_data.dataset.columns import ABSTRACT_STATE
+from astra_data.robots.humanoid import abstraction as phi
 from astra_data.robots.humanoid import target as humanoid
-from astra_data.robots.humanoid.abstraction import (
-    humanoid_to_extended_kinematics,
-    humanoid_to_kinematics,
-    humanoid_to_walker2d,
-    mass_and_feet,
-)
 from astra_data.worlds.simulators import ColdSteps, FreeStates
 from astra_data.worlds.task import column, entries
 
@@ -62,10 +57,10 @@ class HumanoidWalker2d(FreeStates):
         ],
         "torso, legs and foot contacts of a planar walker",
     )
-    abstraction = humanoid_to_walker2d
+    abstraction = phi.humanoid_to_walker2d
 
     def __init__(self, num_envs: int, *, num_threads: int | None = None, device: str = "cpu") -> None:
-        standing = humanoid_to_walker2d(torch.tensor(humanoid.STANDING))
+        standing = phi.humanoid_to_walker2d(torch.tensor(humanoid.STANDING))
         super().__init__(standing.repeat(num_envs, 1).to(device))
         self.memory = self._sunk(self.state)
         self.ranges = humanoid.CommandRanges()
@@ -132,7 +127,7 @@ class HumanoidKinematics(FreeStates):
 
     action_size = 4
     abstract_state = column(ABSTRACT_STATE, _JOINTS, "angles and rates of all joints")
-    abstraction = humanoid_to_kinematics
+    abstraction = phi.humanoid_to_kinematics
 
     ranges = humanoid.CommandRanges()  # joint angles of commands
 
@@ -180,7 +175,7 @@ class HumanoidExtendedKinematics(HumanoidKinematics):
         "angles and rates of all joints; along the heading, centre of mass, from between the feet, "
         "and its velocity; which way is up from the torso, and how fast it turns",
     )
-    abstraction = humanoid_to_extended_kinematics
+    abstraction = phi.humanoid_to_extended_kinematics
 
     def __init__(self, num_envs: int, *, follow_s: float = 0.3, device: str = "cpu") -> None:
         """Build B standing humanoids; `follow_s` is the time constant of the body's velocity and angular velocity."""
@@ -195,8 +190,8 @@ class HumanoidExtendedKinematics(HumanoidKinematics):
     def _moved(self, action: Tensor) -> Tensor:
         """Return joints, center of mass and its velocity, lean and spin (B, 46) after the step."""
         joints = super()._moved(action)
-        mass, feet = mass_and_feet(self.state[:, :_COUNT])
-        later_mass, later_feet = mass_and_feet(joints[:, :_COUNT])
+        mass, feet = phi.mass_and_feet(self.state[:, :_COUNT])
+        later_mass, later_feet = phi.mass_and_feet(joints[:, :_COUNT])
         aside = (later_mass - later_feet.mean(1)) - (mass - feet.mean(1))
         stance = feet[..., 2].argmin(dim=-1)
         rows = torch.arange(len(feet), device=feet.device)

@@ -5,6 +5,7 @@ it takes the mean of what each foot needs; the other joints keep the soles' posi
 """
 
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,28 +31,18 @@ _MIRRORED_POSE = np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
 _MIRRORED_LEG = np.array([-1.0, 1.0, 1.0, 1.0, -1.0])
 
 
-def about_x(angle: Floats) -> Floats:
-    """Return rotations about x, (..., 3, 3)."""
-    return _rotation(angle, 1, 2)
-
-
-def about_y(angle: Floats) -> Floats:
-    """Return rotations about y, (..., 3, 3)."""
-    return _rotation(angle, 2, 0)
-
-
-def about_z(angle: Floats) -> Floats:
-    """Return rotations about z, (..., 3, 3)."""
-    return _rotation(angle, 0, 1)
-
-
-def _rotation(angle: Floats, first: int, second: int) -> Floats:
+def _about(axis: int, angle: Floats) -> Floats:
+    """Return rotations about x, y or z, the `axis` of that number, (..., 3, 3)."""
+    first, second = (axis + 1) % 3, (axis + 2) % 3
     matrix = np.zeros((*np.shape(angle), 3, 3))
     matrix[..., range(3), range(3)] = 1.0
     cos, sin = np.cos(angle), np.sin(angle)
     matrix[..., first, first] = matrix[..., second, second] = cos
     matrix[..., second, first], matrix[..., first, second] = sin, -sin
     return matrix
+
+
+about_x, about_y, about_z = (partial(_about, axis) for axis in range(3))
 
 
 def leg_angles(poses: Floats) -> Floats:

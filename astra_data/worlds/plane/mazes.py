@@ -95,7 +95,7 @@ class Maze:
     def distance_field(self, goal: Floats, *, radius: float = 0.0, margin: float = 0.0) -> Floats:
         """Return the length in m of the shortest free path from each fine cell to `goal` (2,), [y, x].
 
-        Cells within `margin` m of walls cost more; those within `radius` m, or closed off, that of a free one.
+        Cells within `margin` m of walls cost more; those within `radius` m, or closed off, take that of a free one.
         """
         free = self.clearance_field > radius
         goal_cell = self.fine_index(goal)

@@ -7,20 +7,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 import torch
 
-from astra_data.dataset.columns import (
-    ACTION,
-    DONE,
-    GOAL,
-    NEXT_STATE,
-    REWARD,
-    STATE,
-    SUCCESS,
-    TERMINATED,
-    TRUNCATED,
-    Array,
-    Column,
-    Episode,
-)
+from astra_data.dataset import columns as names
+from astra_data.dataset.columns import Array, Column, Episode
 from astra_data.worlds.geometry import PlanarMap
 from astra_data.worlds.objective import Objective
 from astra_data.worlds.task import Task
@@ -59,7 +47,7 @@ class Relocation:
     def stretches(self, episode: Episode) -> list[tuple[int, int]]:
         """Return first step and end of each segment of `episode` that may be moved."""
         free = np.ones(len(episode), dtype=bool)
-        for name in (STATE, NEXT_STATE):
+        for name in (names.STATE, names.NEXT_STATE):
             free &= self._is_free(positions(self.task, episode.columns[name]))
         edges = np.flatnonzero(np.diff(free, prepend=False, append=False)).reshape(-1, 2)
         return [(int(first), int(end)) for first, end in edges if end - first >= self.min_steps]
@@ -73,10 +61,10 @@ class Relocation:
             steps = slice(*stretches[rng.choice(len(stretches), p=lengths / lengths.sum())])
             angle = {"quarter": rng.integers(4) * np.pi / 2, "any": rng.uniform(-np.pi, np.pi), "none": 0.0}
             turn = PlanarMap(float(angle[self.rotations]))
-            action = turn.of_column(self.task.action, episode.columns[ACTION][steps])
+            action = turn.of_column(self.task.action, episode.columns[names.ACTION][steps])
             if not ((action >= least - _ROUNDING) & (action <= largest + _ROUNDING)).all():
                 continue
-            ends = [positions(self.task, episode.columns[name][steps]) for name in (STATE, NEXT_STATE)]
+            ends = [positions(self.task, episode.columns[name][steps]) for name in (names.STATE, names.NEXT_STATE)]
             path = turn.positions(np.concatenate(ends).astype(np.float64))
             shifts = self._draw_shifts(ends[0][0], path, rng)
             # Rounded to float32, as datasets store them.
@@ -88,18 +76,18 @@ class Relocation:
     def copied(self, episode: Episode, moving: Sequence[Column], rng: np.random.Generator) -> Copy | None:
         """Move a part of `episode`, with a goal of its own, judged by the task; None where there is no room."""
         world, movable, has_ball = self.task, episode, self.task.ball_index is not None
-        if has_ball and episode.columns[TERMINATED][-1]:
+        if has_ball and episode.columns[names.TERMINATED][-1]:
             movable = replace(episode, columns={name: each[:-1] for name, each in episode.columns.items()})
         for change, steps in self.placements(movable, rng):
             cut = {name: values[steps] for name, values in movable.columns.items()}
             moved = {column.name: change.of_column(column, cut[column.name]) for column in moving}
             goal = world.objective.draw_goals(rng, 1)[0].astype(np.float32)
-            columns = cut | moved | {GOAL: np.tile(goal, (len(cut[GOAL]), 1))}
-            before, after = (np.asarray(world.abstraction(columns[name])) for name in (STATE, NEXT_STATE))
+            columns = cut | moved | {names.GOAL: np.tile(goal, (len(cut[names.GOAL]), 1))}
+            before, after = (np.asarray(world.abstraction(columns[name])) for name in (names.STATE, names.NEXT_STATE))
             first = (torch.from_numpy(before[:1]), torch.from_numpy(goal[None]))
             if not has_ball or not world.objective.decided(*first):
-                judged = outcomes(world.objective, before, after, goal, cut[TERMINATED] & ~cut[SUCCESS])
-                length = len(judged[DONE])
+                judged = outcomes(world.objective, before, after, goal, cut[names.TERMINATED] & ~cut[names.SUCCESS])
+                length = len(judged[names.DONE])
                 return Copy({name: values[:length] for name, values in columns.items()} | judged, change, steps)
         return None
 
@@ -125,9 +113,9 @@ def outcomes(objective: Objective, before: Array, after: Array, goal: Array, top
     length = int(terminated.argmax()) + 1 if terminated.any() else len(terminated)
     done = np.arange(length) == length - 1
     return {
-        REWARD: objective.reward(start, end, goals, failed).numpy()[:length],
-        TERMINATED: terminated[:length],
-        TRUNCATED: done & ~terminated[:length],
-        DONE: done,
-        SUCCESS: success.numpy()[:length],
+        names.REWARD: objective.reward(start, end, goals, failed).numpy()[:length],
+        names.TERMINATED: terminated[:length],
+        names.TRUNCATED: done & ~terminated[:length],
+        names.DONE: done,
+        names.SUCCESS: success.numpy()[:length],
     }
