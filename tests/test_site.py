@@ -112,14 +112,14 @@ def test_links_lead_somewhere_and_nothing_is_loaded_from_elsewhere(site: Path) -
     assert not elsewhere
 
 
-@pytest.mark.parametrize("name", DOCS)
-def test_every_page_is_in_the_navigation_and_shows_what_github_shows(site: Path, name: str) -> None:
-    place = "" if name == "index" else f"{name}/"
+def test_every_page_is_in_the_navigation_and_shows_what_github_shows(site: Path) -> None:
     navigation = (site / "404.html").read_text()  # which has nothing else
-    assert f'href="/{place or "."}"' in navigation
-    markdown = MarkdownIt("commonmark").enable("table").render((ROOT / f"docs/{name}.md").read_text())
-    shown, expected = page(site / place / "index.html").tags, Page(markdown).tags
-    assert {tag: shown[tag] for tag in COUNTED} == {tag: expected[tag] for tag in COUNTED}
+    for name in DOCS:
+        place = "" if name == "index" else f"{name}/"
+        assert f'href="/{place or "."}"' in navigation
+        markdown = MarkdownIt("commonmark").enable("table").render((ROOT / f"docs/{name}.md").read_text())
+        shown, expected = page(site / place / "index.html").tags, Page(markdown).tags
+        assert {tag: shown[tag] for tag in COUNTED} == {tag: expected[tag] for tag in COUNTED}, name
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: str(path.stem))
@@ -161,20 +161,20 @@ def agrees(row: list[str], key: str, model: dict[str, Any], usual: dict[str, Any
     )
 
 
-@pytest.mark.parametrize("table", TABLES)
-def test_every_key_of_recipes_has_its_default_and_meaning(site: Path, table: str) -> None:
+def test_every_key_of_recipes_has_its_default_and_meaning(site: Path) -> None:
     reference = page(site / "reference/recipe_keys/index.html")
-    schema = SCHEMA["properties"][table]
-    models = models_of(schema)
-    if not models:
-        assert agrees(reference.keys("Keys of recipes")[table], table, SCHEMA, {})
-    for model in models:
-        rows = reference.keys(f"[{table}]")
-        if len(models) > 1:
-            rows |= reference.keys(f'[{table}] learner = "{model["properties"]["learner"]["const"]}"')
-        assert sorted(rows) == sorted(model["properties"])
-        faults = [key for key in rows if not agrees(rows[key], key, model, schema.get("default") or {})]
-        assert not faults
+    for table in TABLES:
+        schema = SCHEMA["properties"][table]
+        models = models_of(schema)
+        if not models:
+            assert agrees(reference.keys("Keys of recipes")[table], table, SCHEMA, {}), table
+        for model in models:
+            rows = reference.keys(f"[{table}]")
+            if len(models) > 1:
+                rows |= reference.keys(f'[{table}] learner = "{model["properties"]["learner"]["const"]}"')
+            assert sorted(rows) == sorted(model["properties"]), table
+            faults = [key for key in rows if not agrees(rows[key], key, model, schema.get("default") or {})]
+            assert not faults, table
 
 
 def named_by_help(*words: str) -> list[str]:
