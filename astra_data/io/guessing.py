@@ -131,11 +131,11 @@ class Logs:
         if not self.of("time"):
             return f"the logs have no time field, so {self.rate} rows per second are assumed: set fps and TIMESTEP_S"
         error = self.recorded_rate / self.rate - 1
-        told = (
+        warning = (
             f"the logs have {self.recorded_rate:.4g} rows per second, not a whole number: TIMESTEP_S is "
             f"{abs(error):.1%} too {'long' if error > 0 else 'short'}; resample them to {self.rate} rows per second"
         )
-        return told if abs(error) >= _EVEN else ""
+        return warning if abs(error) >= _EVEN else ""
 
     @property
     def still(self) -> str:

@@ -118,7 +118,7 @@ CARDS = sorted((Path(__file__).parents[3] / "dataset_cards").glob("*.md"))
 
 
 @pytest.mark.parametrize("path", CARDS, ids=lambda path: path.stem)
-def test_a_card_says_what_the_hub_reads_and_names_every_column(path: Path) -> None:
+def test_a_card_has_its_columns_the_words_of_its_notes_and_its_figure(path: Path) -> None:
     card = DatasetCard.load(path)
     assert card.data.license == "apache-2.0" and "LeRobot" in card.data.tags
     assert f"# {path.stem}\n" in card.text
@@ -127,10 +127,6 @@ def test_a_card_says_what_the_hub_reads_and_names_every_column(path: Path) -> No
     if task is not None:
         names = [column.name for column in (*task.state_columns, *OUTCOME_COLUMNS)]
     assert [name for name in names if f"`{name}`" not in card.text] == []
-
-
-@pytest.mark.parametrize("path", CARDS, ids=lambda path: path.stem)
-def test_a_card_has_the_words_of_its_notes_and_its_figure(path: Path) -> None:
     notes = load_recipe(path.with_suffix(".toml"), Notes)
     text = path.read_text(encoding="utf-8")
     assert [words for words in notes.model_dump().values() if words.strip() not in text] == []

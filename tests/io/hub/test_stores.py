@@ -303,18 +303,16 @@ def test_other_files_in_the_folder_are_left_out(tmp_path: Path) -> None:
     assert dataset_files(tmp_path) == [DATA, "meta/info.json"]
 
 
-@pytest.mark.parametrize(
-    "path",
-    [
+def test_a_path_that_is_none_of_a_dataset_is_refused() -> None:
+    paths = [
         *("../x", "/etc/passwd", "data/../../x", "data/..", "data/./x", "data//x", "data/", "meta"),
         *("data\\..\\x", "C:/x", "data/x\0y", "data/~/.ssh", "README.md", ".cache/x", "data/.x", "data/x y"),
         *("data/evil.sh", "data/chunk-000/x.sh", "data/chunk-000/file-000.parquet.py", "meta/astra/x.pkl"),
         *("data/chunk-\u0660\u0660\u0660/file-000.parquet", "meta/evil.json", "meta/astra/a/b.json"),
-    ],
-)
-def test_a_path_that_is_none_of_a_dataset_is_refused(path: str) -> None:
-    with pytest.raises(SharingError, match="expected one of a dataset's files, within data/, meta/ or videos/"):
-        parse_sums(f"{DIGEST}  meta/info.json\n{DIGEST}  {path}\n", "it")
+    ]
+    for path in paths:
+        with pytest.raises(SharingError, match="expected one of a dataset's files, within data/, meta/ or videos/"):
+            parse_sums(f"{DIGEST}  meta/info.json\n{DIGEST}  {path}\n", "it")
 
 
 def test_every_fault_is_told() -> None:
