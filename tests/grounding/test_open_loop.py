@@ -12,6 +12,7 @@ from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.model import GroundingModel, GroundingShape
 from astra_data.grounding.open_loop import _interval, _starts, distances, gap_report, replay_open_loop
 from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.grounding.scatter import ScatterModel, ScatterShape
 from astra_data.grounding.simulator import NO_GROUNDING, Grounding
 from astra_data.worlds.plane.point_mass import PointMass
 
@@ -60,6 +61,11 @@ def test_a_constant_correction_closes_a_constant_gap() -> None:
     report = gap_report(TASK, grounding, one, seed=0)
     assert report["raw"]["position_m"]["mean"][-1] > 0.5
     assert report["grounded"]["position_m"]["mean"] == pytest.approx([0.0] * 3, abs=2e-3)
+    went_m = [0.5 * 0.5 * TASK.timestep_s * steps for steps in (1, 10, 50)]
+    assert report["still"]["position_m"]["mean"] == pytest.approx(went_m, rel=1e-3)
+    scattered = ScatterModel(ScatterShape(8 + 2 + 4 + 16, 4, 1))
+    scattered.forms.fill_(1.0)
+    assert gap_report(TASK, replace(grounding, scatter_model=scattered), one, seed=0) == report
 
 
 def test_the_last_real_step_counts_and_the_one_after_does_not() -> None:
@@ -97,6 +103,15 @@ def test_intervals_are_percentiles_of_means_over_resampled_episodes() -> None:
     # What repeats within an episode tells nothing new.
     again = _interval(errors.repeat(5), episode.repeat(5), np.random.default_rng(0))
     assert again == pytest.approx((mean, low, high))
+    absent = _interval(errors, 2 * episode, np.random.default_rng(0))
+    assert absent == pytest.approx((mean, low, high))  # each second is absent
+    # Longer episodes have more weight.
+    episode = torch.arange(6).repeat_interleave(torch.arange(1, 7))
+    drawn = np.random.default_rng(1).choice(np.arange(6), (1000, 6))
+    of = [errors[:21][episode == number].numpy() for number in range(6)]
+    means = [np.concatenate([of[number] for number in row]).mean() for row in drawn]
+    expected = (float(errors[:21].mean()), *np.quantile(means, [0.025, 0.975]))
+    assert _interval(errors[:21], episode, np.random.default_rng(1)) == pytest.approx(expected)
 
 
 def test_a_grounding_starts_with_the_history_before_each_replay() -> None:

@@ -176,7 +176,10 @@ def test_rows_that_lack_a_number_are_left_out_and_counted(tmp_path: Path) -> Non
         (b"x,x,cmd\n1,2,3\n2,3,4\n", "log.csv: the header has x more than once"),
         (b"t,x\n0,1\n1,2\n2,3\n", "found no command among t (time), x (state): name one in the header, such as cmd_v"),
         (b"cmd,x\n0,1\n1,1\n", "found no state among cmd (command), x (left out): name one"),
-        (b"x,cmd\n" + b"0,1\n" * 9 + b"1,2\n" * 9 + b"2,fast\n", "log.csv line 20: field 'cmd': expected numbers, or true"),
+        (
+            b"x,cmd\n" + b"0,1\n" * 9 + b"1,2\n" * 9 + b"2,fast\n",
+            "log.csv line 20: field 'cmd': expected numbers, or true",
+        ),
         (b"x;cmd\n0,5;1\n1;2\n", "got semicolons in its header: write it with commas"),
         (b"x,neigung_\xb0,cmd\n0,0,0\n1,1,1\n", "expected text in UTF-8, got the byte 0xb0: save it as UTF-8"),
         (b"t_s,x,cmd\n0,0,0\n0.4,1,1\n0.8,2,2\n", "t_s: expected rows per second within 10% of a whole number"),

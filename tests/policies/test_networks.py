@@ -101,11 +101,12 @@ def test_the_density_of_an_action_is_that_of_its_distribution() -> None:
         if isinstance(policy, SoftActor):
             drawn, density = policy.sample(OBSERVATION)
             torch.testing.assert_close(density, policy.log_prob(OBSERVATION, drawn), atol=1e-3, rtol=1e-3)
-            policy.actor[-1].requires_grad_(False).weight.zero_()
-            policy.actor[-1].bias.zero_()
+            for parameter in [*policy.actor.parameters()][-2:]:
+                parameter.requires_grad_(False).zero_()
             torch.testing.assert_close(policy.policy(OBSERVATION)[1], torch.full((3, 5, 2), 1.001))
-        else:
-            sizes = [network[-1].weight.norm(dim=1).max().item() for network in (policy.actor, policy.critic)]
+        elif isinstance(policy, ActorCritic):
+            weights = ([*network.parameters()][-2].detach() for network in (policy.actor, policy.critic))
+            sizes = [float(weight.norm(dim=1).max()) for weight in weights]
             assert sizes == pytest.approx([0.01, 1.0], rel=1e-3)
 
 

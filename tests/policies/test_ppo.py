@@ -83,6 +83,7 @@ def test_an_update_is_that_of_the_printed_loss(monkeypatch: pytest.MonkeyPatch) 
     for name, value in {**settings, "GRADIENT_NORM": 0.3, "_PULL": 0.4}.items():
         monkeypatch.setattr(module, name, value)
     learner = ppo(EndsAtZero(32), 3, horizon=5)
+    assert float(list(learner.policy.critic.parameters())[-2].norm().detach()) == pytest.approx(0.01)
     last_layer(learner).weight.data.mul_(300.0)
     last_layer(learner).bias.data.fill_(0.8)
     ours, theirs = learner.policy, copy.deepcopy(learner.policy)
