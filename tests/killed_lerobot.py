@@ -1,4 +1,4 @@
-"""Datasets whose lerobot writer was killed: `python killed_lerobot.py FOLDER` makes one folder per case.
+"""Datasets whose lerobot writer was killed: `main` makes one folder per case.
 
 whole      8 episodes, finalized
 saved      25 episodes saved, killed before finalize: no file has a footer
@@ -8,7 +8,6 @@ resumed    5 episodes finalized, 3 more in a resumed session, killed
 
 import os
 import signal
-import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -100,7 +99,3 @@ def main(folder: Path) -> None:
 def kill_oneself(case: Callable[[], object]) -> None:
     _unfinished = case()  # kept: lerobot closes its files when the dataset is collected
     os.kill(os.getpid(), signal.SIGKILL)
-
-
-if __name__ == "__main__":
-    main(Path(sys.argv[1]))

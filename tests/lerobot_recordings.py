@@ -4,12 +4,14 @@ arm      4 episodes of two tasks, with a camera, rewards, forces as float64; one
 ant      3 episodes of a state and an action
 blind    cameras and actions, without a state
 merged   our datasets A and B, merged by lerobot's tools
+killed   what `killed_lerobot` leaves behind
 """
 
 import sys
 from pathlib import Path
 from typing import Any
 
+import killed_lerobot
 import numpy as np
 
 JOINTS = ["shoulder", "elbow", "wrist"]
@@ -71,4 +73,5 @@ def main(folder: Path, merged: list[Path]) -> None:
 
 
 if __name__ == "__main__":
+    killed_lerobot.main(Path(sys.argv[1]) / "killed")  # first: a fork has none of the threads that a recording starts
     main(Path(sys.argv[1]), [Path(path) for path in sys.argv[2:]])

@@ -1,12 +1,19 @@
+import os
+import subprocess
+import sys
 import warnings
 from collections.abc import Iterator
 from importlib import import_module
+from pathlib import Path
 from types import SimpleNamespace
 
+import lerobot_recordings
 import pytest
-from fake_dataset import write_fake
+from fake_dataset import fake_columns, write_fake, writer
 from fake_frames import NAMES
+from shared_runs import shared
 
+from astra_data.dataset.columns import Episode
 from astra_data.dataset.frames import Frames
 from astra_data.dataset.reader import Dataset
 
@@ -20,6 +27,25 @@ def fake(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 @pytest.fixture(scope="session")
 def frames(fake: Dataset) -> Frames:
     return Frames.load(fake, NAMES)
+
+
+def record(folder: Path) -> None:
+    """Write the datasets `a` and `b`, and in one process what `lerobot_recordings` makes."""
+    write_fake(folder / "a")
+    with writer(folder / "b") as open_writer:
+        for uid, length in ((13, 5), (7, 4)):
+            facts = {"success": False, "return": -1.0, "source_episode": 13}
+            open_writer.add(Episode(uid, fake_columns(length, seed=uid + 100), facts))
+    settings = {"HF_HUB_OFFLINE": "1", "HF_HOME": str(folder / "cache"), "OMP_NUM_THREADS": "1"}
+    names = [str(folder), str(folder / "a"), str(folder / "b")]
+    command = [sys.executable, lerobot_recordings.__file__, *names]
+    subprocess.run(command, env=os.environ | settings, check=True, capture_output=True)
+
+
+@pytest.fixture(scope="session")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folders that lerobot wrote, `killed` of a killed writer, and the two datasets behind `merged`."""
+    return shared(tmp_path_factory, "recorded", record)
 
 
 @pytest.fixture(scope="module")

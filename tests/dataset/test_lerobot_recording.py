@@ -2,19 +2,15 @@
 
 import json
 import logging
-import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
-import lerobot_recordings
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from damaged import DATA, alter_rows
-from fake_dataset import fake_columns, write_fake, writer
+from fake_dataset import write_fake
 from lerobot_recordings import JOINTS, values
 from typer.testing import CliRunner
 
@@ -31,7 +27,6 @@ from astra_data.dataset.columns import (
     TERMINATED,
     TRUNCATED,
     Array,
-    Episode,
 )
 from astra_data.dataset.doctor.check import check
 from astra_data.dataset.doctor.repair import repair
@@ -62,22 +57,6 @@ class Glider:
     def step(self, action):
         return self.state + 0.1 * action
 """
-
-
-@pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folders that `lerobot_recordings` makes, and the two datasets `a` and `b` behind `merged`."""
-    folder = tmp_path_factory.mktemp("recorded")
-    write_fake(folder / "a")
-    with writer(folder / "b") as open_writer:
-        for uid, length in ((13, 5), (7, 4)):
-            facts = {"success": False, "return": -1.0, "source_episode": 13}
-            open_writer.add(Episode(uid, fake_columns(length, seed=uid + 100), facts))
-    settings = {"HF_HUB_OFFLINE": "1", "HF_HOME": str(folder / "cache"), "OMP_NUM_THREADS": "1"}
-    names = [str(folder), str(folder / "a"), str(folder / "b")]
-    command = [sys.executable, lerobot_recordings.__file__, *names]
-    subprocess.run(command, env=os.environ | settings, check=True, capture_output=True)
-    return folder
 
 
 @pytest.fixture

@@ -1,8 +1,5 @@
 import json
-import os
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -23,14 +20,10 @@ from astra_data.dataset.format import DATASET_PATH, DIGESTS_PATH, INFO_PATH, MET
 from astra_data.dataset.lerobot_rows import RECORDED_TASK
 
 
-@pytest.fixture(scope="module")
-def killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+@pytest.fixture
+def killed(recorded: Path) -> Path:
     """The folders that `killed_lerobot` leaves behind."""
-    folder = tmp_path_factory.mktemp("killed")
-    settings = {"HF_HUB_OFFLINE": "1", "HF_HOME": str(folder / "cache"), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, killed_lerobot.__file__, str(folder)]
-    subprocess.run(command, env=os.environ | settings, check=True, capture_output=True)
-    return folder
+    return recorded / "killed"
 
 
 def assert_saved(root: Path, episodes: int) -> None:
