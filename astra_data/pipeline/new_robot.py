@@ -112,7 +112,7 @@ def _values(name: str, simulator: SimulatorKind) -> dict[str, str]:
     highs = np.where(highs > lows, highs, lows + unit)  # of a command that never changes
     ranges = zip(commands, lows, highs, strict=True)
     bounds = ", ".join(f"{_code(command.short)}: {_code((low, high))}" for command, low, high in ranges)
-    return {
+    values = {
         "name": name,
         "called": simulator.called,
         "simulator": simulator.code(),
@@ -124,12 +124,10 @@ def _values(name: str, simulator: SimulatorKind) -> dict[str, str]:
         * bool(logs.left_out),
         "split": "".join(["\n[split]\n", *split]) if split else "",
         "columns": "\n".join(_column(role, logs) for role in _COLUMNS if logs.of(role)),
-        "size": str(len(states)),
-        "state": _code(tuple(field.short for field in states)),
-        "state_units": _code([field.unit for field in states]),
         "command_size": str(len(commands)),
-        "command_names": _code(tuple(field.short for field in commands)),
-        "command_units": _code([field.unit for field in commands]),
+        "state": _declared(STATE, states),
+        "action": _declared(ACTION, commands),
+        "goal": f"\n    goal={_declared(GOAL, logs.of('goal'))}," if logs.of("goal") else "",
         "bounds": f"{{{bounds}}}",
         "still": f"; {logs.still}" if logs.still else "",
         "horizon": str(max(map(len, logs.values(states)))),
@@ -138,12 +136,17 @@ def _values(name: str, simulator: SimulatorKind) -> dict[str, str]:
         "phi": _code(first[0]),
         "command": _code(command[0]),
         "landed": _code(simulator.after(first, [command])[0]),
-        **_objective(simulator),
     }
+    return values | {"objective": _objective(simulator, values)}
 
 
-def _objective(simulator: SimulatorKind) -> dict[str, str]:
-    """Return what the template names of the objective, to come to where logs go, and its code."""
+def _declared(name: str, fields: Sequence[Field]) -> str:
+    names, units = _code(tuple(field.short for field in fields)), _code([field.unit for field in fields])
+    return f'Column("{name}", size={len(fields)}, names={names}, astra={{"unit": {units}}})'
+
+
+def _objective(simulator: SimulatorKind, values: dict[str, str]) -> str:
+    """Return the code of the objective, to come to where logs go; add to `values` what the template names of it."""
     logs, is_planar = simulator.logs, simulator.called != DIRECT
     recorded = [states for states, _ in simulator.episodes()]
     width = 2 if is_planar else len(simulator.names)
@@ -165,8 +168,8 @@ def _objective(simulator: SimulatorKind) -> dict[str, str]:
         bounds = f"{_code(every.min(axis=0))}, {_code(every.max(axis=0))}, (count, {len(goals)})"
         text = f"\n    goal_size = {len(goals)}\n\n    def draw_goals(self, rng, count):  # CHECK: where goals are{use}"
         text += f"\n        return rng.uniform({bounds})"
-    values = {
-        "command_size": str(len(logs.of("command"))),
+    sizes = [f"\n{name} = {value!r}  # CHECK: fitted to the logs" for name, value in simulator.constants.items()]
+    values |= {
         "goals": text,
         "starts": unpacked([entry.name for entry in simulator.entries]),
         "lows": _code([low for low, _ in pairs]),
@@ -174,16 +177,13 @@ def _objective(simulator: SimulatorKind) -> dict[str, str]:
         "start_size": str(len(pairs)),
         "drawn": ", ".join(drawn),
         "target": f"goal[..., {taken}]" if taken else "state.new_tensor(GOAL)",
-    }
-    sizes = [f"\n{name} = {value!r}  # CHECK: fitted to the logs" for name, value in simulator.constants.items()]
-    return {
         "names": _code(tuple(simulator.names)),
         "constants": "".join(sizes),
         "goal_line": "" if taken else f"GOAL = {_code(tuple(goal * shares))}  # CHECK: where to go\n",
         "close": f"{way / 10:.2g}",
         "range": f"{way:.3g}" if is_planar else _code(tuple(spans)),
-        "objective": filled("planar.py" if is_planar else "direct.py", values),
     }
+    return filled("planar.py" if is_planar else "direct.py", values)
 
 
 def _goals_of(simulator: SimulatorKind, *, is_planar: bool) -> list[int]:

@@ -31,7 +31,7 @@ def check_task(task: Task, device: str = "cpu") -> list[str]:
             faults.append(str(error))
             return None
 
-    for check in (_rate, _abstraction, _quantities, _beyond, _robot):
+    for check in (_rate, _abstraction, _quantities, _beyond):
         tried(check)
     starts = tried(_drawn, "starts", task.abstract_state.size)
     goals, simulator = tried(_drawn, "goals", task.objective.goal_size), tried(_simulator, device)
@@ -43,6 +43,8 @@ def check_task(task: Task, device: str = "cpu") -> list[str]:
         before, after, goals = (values.to(device) for values in (starts, landed, goals))
         for judge in (_observation, _places, _judgement):
             tried(judge, before, after, goals)
+    if not faults:  # a robot's step judges, too
+        tried(_robot)
     return faults
 
 
@@ -110,12 +112,13 @@ def _beyond(task: Task) -> None:
 def _robot(task: Task) -> None:
     if task.robot is None:
         return
-    with explained("robot: to build and to reset it"):
+    with explained("robot: to build, reset and step it"):
         env = task.target(1, seed=0)
         env.reset()
         abstract = task.abstraction(env.state)
         if isinstance(env, RobotEnv):
             env.check_commands()
+        env.step(torch.zeros(1, len(task.limits)))
     expect("abstraction (φ) of the robot's state", abstract, (1, task.abstract_state.size))
 
 
