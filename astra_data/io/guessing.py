@@ -150,14 +150,10 @@ def guess(paths: Sequence[Path]) -> Logs:
     """Read CSV logs, files with the same fields or folders of them, and guess what their fields are."""
     sources = [Source(file, None, file) for path in paths for file in csv_files(path)]
     tables, torn = zip(*map(read_numbers, sources), strict=True)
-    first, names = (
-        sources[0].path,
-        [{name for name, values in one.items() if np.isfinite(values).any()} for one in tables],
-    )
-    for source, table, filled in zip(sources, tables, names, strict=True):
-        if {*filled, *names[0]} - (table.keys() & tables[0].keys()):
-            fields_of = [[name for name in tables[0] if name in names[0]], [name for name in table if name in filled]]
-            raise BadInputError(f"{source.path}: expected the fields of {first}, {fields_of[0]}: got {fields_of[1]}")
+    first, filled = sources[0].path, [[name for name, v in one.items() if np.isfinite(v).any()] for one in tables]
+    for source, table, names in zip(sources, tables, filled, strict=True):
+        if {*names, *filled[0]} - (table.keys() & tables[0].keys()):
+            raise BadInputError(f"{source.path}: expected the fields of {first}, {filled[0]}: got {names}")
     raw = [episode for table in tables for episode in _episodes(table)]
     fields: list[Field] = []
     for name in (name for name in tables[0] if all(name in table for table in tables)):

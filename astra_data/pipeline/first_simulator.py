@@ -168,11 +168,14 @@ def first_simulator(logs: Logs) -> SimulatorKind:
         shares = [float(np.divide(found, still, np.ones(2), where=still > 0).mean()) for found, still in errors]
         best = next(at for at, share in enumerate(shares) if share <= CLEARLY * min(shares))
         good, (simulated, still) = kinds[best], errors[best]
-    along = {name for name, way in good.driven.items() if way != "turn"} if good else set()
-    if good and "left" in good.driven.values() and along <= direct.driven.keys():
-        moved, place = direct.errors()[0], [one.code[0] for one in good.entries[:2]]
-        along_axes = sum(moved[direct.names.index(name)] for name in place) if {*place} <= {*direct.names} else still[0]
-        good = good if simulated[0] < along_axes else None  # two arms, or a base that is driven along x and y
+        along = {name for name, way in good.driven.items() if way != "turn"}
+        if "left" in good.driven.values() and along <= direct.driven.keys():
+            moved, place = (
+                dict(zip(direct.names, direct.errors()[0], strict=True)),
+                [e.code[0] for e in good.entries[:2]],
+            )
+            along_axes = sum(moved[name] for name in place) if {*place} <= moved.keys() else still[0]
+            good = good if simulated[0] < along_axes else None  # two arms, or a base that is driven along x and y
     if not good:
         if not direct.entries:
             raise BadInputError("found no state that a command could move: name it as its command, cmd_q1 and q1")
@@ -195,7 +198,9 @@ def identifiers(fields: Sequence[Field], prefix: str = "") -> dict[str, str]:
         plain = f"{prefix}{one.plain}"
         if not plain.isidentifier() or keyword.iskeyword(plain) or plain in ("of", "np", "torch", "state", "self"):
             plain = f"s_{plain}" if f"s_{plain}".isidentifier() else f"s_{len(found)}"
-        found[one.name] = plain + "_2" * list(found.values()).count(plain)
+        while plain in found.values():
+            plain += "_2"
+        found[one.name] = plain
     return found
 
 
