@@ -19,6 +19,7 @@ import tempfile
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Annotated
@@ -83,6 +84,17 @@ def draw_mutants(path: Path, count: int, draw: random.Random) -> list[Mutant]:
     return found
 
 
+@cache
+def imported_by(test: Path) -> set[str]:
+    """Return the names that a test file imports from modules."""
+    return {
+        f"{node.module}.{alias.name}"
+        for node in ast.walk(ast.parse(test.read_text()))
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+
+
 def tests_of(path: Path) -> list[str]:
     """Return the mirrored test file, that of the room, and those that import the module at `path`."""
     module = ".".join(path.with_suffix("").parts).removesuffix(".__init__")
@@ -92,13 +104,7 @@ def tests_of(path: Path) -> list[str]:
         test for test in (folder / f"test_{path.name}", folder / f"test_{folder.name}.py") if (ROOT / test).exists()
     ]
     for test in sorted(ROOT.glob("tests/**/test_*.py")):
-        names = {
-            f"{node.module}.{alias.name}"
-            for node in ast.walk(ast.parse(test.read_text()))
-            if isinstance(node, ast.ImportFrom)
-            for alias in node.names
-        }
-        if any(one == f"{package}.{name}" or one.startswith(f"{module}.") for one in names):
+        if any(one == f"{package}.{name}" or one.startswith(f"{module}.") for one in imported_by(test)):
             found.append(test.relative_to(ROOT))
     return [str(test) for test in dict.fromkeys(found)]
 

@@ -6,7 +6,7 @@ from fake_dataset import LENGTHS, concatenated, write_fake
 
 from astra_data.dataset import Dataset, DatasetWriter
 from astra_data.dataset.columns import ACTION, NEXT_STATE, REWARD, STATE, SUCCESS, TERMINATED, Column, Episode
-from astra_data.dataset.inspection import BINS, Endings, Inspection, endings_of, inspect_dataset, outcome_of
+from astra_data.dataset.inspection import BINS, CELLS, Endings, Inspection, endings_of, inspect_dataset, outcome_of
 
 
 @pytest.fixture(scope="module")
@@ -33,6 +33,8 @@ def test_the_map_counts_every_position_where_it_was(inspection: Inspection) -> N
     points = concatenated(STATE)[:, :2].astype(np.float64)
     left, right, bottom, top = places.extent
     edges = [np.linspace(bottom, top, len(places.counts) + 1), np.linspace(left, right, places.counts.shape[1] + 1)]
+    assert (right - left, top - bottom) == pytest.approx(places.cell * np.array(places.counts.shape[::-1]))
+    assert max(places.counts.shape) == CELLS and places.cell == pytest.approx(np.ptp(points, axis=0).max() / CELLS)
     theirs, _, _ = np.histogram2d(points[:, 1], points[:, 0], edges)
     assert np.abs(places.counts - theirs).sum() <= 4 and places.counts.sum() == sum(LENGTHS)
     assert inspection.velocities is None  # no column has that role

@@ -13,7 +13,7 @@ from fake_dataset import COLUMNS, LENGTHS, concatenated, fake_columns, fake_epis
 
 from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.dataset import Dataset, parquet
-from astra_data.dataset.columns import ACTION, STATE, Episode
+from astra_data.dataset.columns import ACTION, STATE, SUCCESS, Episode
 from astra_data.dataset.doctor.check import check
 from astra_data.dataset.doctor.repair import repair
 
@@ -89,7 +89,9 @@ def test_success_is_taken_from_the_metadata_or_else_from_the_column(tmp_path: Pa
     def successes(name: str, *metadata: dict[str, bool | str]) -> list[bool | None] | None:
         with writer(tmp_path / name) as open_writer:
             for uid, facts in enumerate(metadata):  # in the column, those of odd uids succeed
-                open_writer.add(Episode(uid, fake_columns(3, seed=uid), facts))
+                columns = fake_columns(3, seed=uid)
+                columns[SUCCESS] = np.array([False, bool(uid % 2), False])
+                open_writer.add(Episode(uid, columns, facts))
         return Dataset.open(tmp_path / name).successes()
 
     assert successes("metadata", {"success": True}, {"success": False}) == [True, False]

@@ -27,7 +27,7 @@ def test_versions_order_as_numbers() -> None:
 
 
 def test_the_next_version_is_free() -> None:
-    taken = versions("1.2.3", "1.4.0", "1.2.7", "3.1.0")
+    taken = versions("1.2.3", "1.4.0", "1.2.7", "3.9.0")
     version = Version.parse("1.2.3")
     assert str(version.next("columns", taken)) == "4.0.0" and str(version.next("episodes", taken)) == "1.5.0"
     assert str(version.next("description", taken)) == "1.2.8"
@@ -64,8 +64,8 @@ def test_a_successor_names_its_parent_and_its_place(home: Path, tmp_path: Path) 
     assert folder == home_of(description) == home / source.description["name"] / "data-1.1.0"
     folder.mkdir(parents=True)
     assert successor(source.description, "episodes", stage="subset", config={})[0]["version"] == "1.2.0"
-    elsewhere = successor(source.description, "columns", stage="pair", config={}, out=tmp_path / "here")
-    assert (elsewhere[0]["version"], elsewhere[1]) == ("2.0.0", tmp_path / "here")
+    elsewhere = successor(source.description, "episodes", stage="filter", config={}, out=tmp_path / "here")
+    assert (elsewhere[0]["version"], elsewhere[1]) == ("1.1.0", tmp_path / "here")
     assert open_dataset(tmp_path / "first").reference == source.reference
 
 

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -137,7 +138,10 @@ def test_a_state_is_worth_the_expectile_of_what_its_actions_pay(
 
 
 def test_returns_are_those_of_a_plain_loop() -> None:
-    experience = walks(count=5, steps=7)
+    experience = walks(count=20, steps=7)
+    padding = torch.arange(7) >= experience.lengths[:, None]
+    assert padding.any()
+    experience = replace(experience, reward=experience.reward + 5.0 * padding)
     settings = config(return_steps=3, discount=0.9, reward_scale=2.0)
     table = transitions(experience, settings)
     row = 0
@@ -159,7 +163,8 @@ def test_returns_are_those_of_a_plain_loop() -> None:
 def test_updates_are_those_of_the_printed_losses(monkeypatch: pytest.MonkeyPatch) -> None:
     """Kostrikov et al. (2022): expectile regression, then advantage-weighted regression."""
     monkeypatch.setattr(module, "_GRADIENT_NORM", 1e-3)
-    settings = config(expectile=0.8, temperature=3.0, critic_updates=1, policy_updates=1, reward_scale=9.0)
+    settings = config(expectile=0.8, temperature=150.0, critic_updates=1, policy_updates=1, reward_scale=9.0)
+    settings = settings.model_copy(update={"return_steps": 3})
     experience = walks()
     iql = learner(experience, settings)
 
@@ -176,11 +181,19 @@ def test_updates_are_those_of_the_printed_losses(monkeypatch: pytest.MonkeyPatch
     ahead = advantage(table.observation[rows], table.action[rows])
     assert (ahead > 0).any() and (ahead < 0).any()
     expected = torch.where(ahead > 0, 0.8, 0.2) * ahead.square()
-    assert iql.iterate()["value"] == pytest.approx(float(expected.mean()), rel=1e-4)
+    with torch.no_grad():
+        after = iql._critics.value(table.next_observation[rows]).squeeze(-1) * ~table.terminated[rows]
+        pair = torch.cat([table.observation[rows], table.action[rows]], dim=-1)
+        wanted = table.reward[rows] + 0.9**3 * after
+        wrong = sum(float((q(pair).squeeze(-1) - wanted).square().mean()) for q in iql._critics.action_values)
+    losses = iql.iterate()
+    assert losses["value"] == pytest.approx(float(expected.mean()), rel=1e-4)
+    assert losses["action_value"] == pytest.approx(wrong, rel=1e-4)
     torch.manual_seed(derive(2, "update 1"))
     steps, learned = experience.draw(16, 16, 4)
     observation, action = experience.observation[steps], experience.action[steps]
-    weight = (3.0 * advantage(observation, action)).exp().clamp_max(100.0)
+    weight = (150.0 * advantage(observation, action)).exp().clamp_max(100.0)
+    assert (weight == 100.0).any() and (weight < 100.0).any()
     with torch.no_grad():
         normal = torch.distributions.Normal(*iql.policy.policy(observation))
         log_prob = normal.log_prob(action).sum(-1)

@@ -8,7 +8,7 @@ from torch import nn
 from toy_worlds import ConstantReward, GoToZero
 
 from astra_data.core.seeding import derive
-from astra_data.policies.learner import Learner, is_mastered, penalty_scale
+from astra_data.policies.learner import Learner, is_mastered, lately, penalty_scale
 from astra_data.worlds.protocols import BatchedEnv
 
 
@@ -136,6 +136,8 @@ def test_at_random_ages_not_all_expire_at_once() -> None:
     rows = Noisy(GoToZero(1000), 1, horizon=10, is_staggered=True)
     expired = [int(take(rows)[0].sum()) for _ in range(20)]
     assert min(expired) > 60 and max(expired) < 140 and expired[:10] == expired[10:]
+    # The first ones, of 1 to 10 steps, and the second of 10.
+    assert rows.figures()["episode_steps"] == pytest.approx(7.75, abs=0.2)
 
 
 def curve(*successes: float | None) -> list[dict[str, float | None]]:
@@ -184,3 +186,4 @@ def test_penalties_grow_over_a_quarter_while_it_is_mastered_and_shrink_as_fast(
 def test_at_a_faster_pace_they_grow_with_the_share() -> None:
     points = [{"share": 0.1, "success": 1.0}, {"share": 0.225, "success": 1.0}]
     assert penalty_scale(points) == pytest.approx(0.9)
+    assert lately(curve(0.0, *[1.0] * 10), "success") == "success of training episodes 1.00"
