@@ -55,6 +55,7 @@ def test_a_grounding_of_the_users_own_is_read_once_it_is_known(tmp_path: Path, m
     with pytest.raises(BadInputError, match="found kind shifted"):
         load_grounding(path)
     monkeypatch.setitem(KINDS, Shifted.kind, Shifted)
+    monkeypatch.setitem(KINDS, Lossy.kind, Shifted)
     found = load_grounding(path)
     assert isinstance(found, Shifted) and found.shift.tolist() == [1.0, 1.0]
     with pytest.raises(BadInputError, match="expected a history model, got a grounding without latents"):
@@ -95,6 +96,7 @@ def test_what_a_grounding_of_one_s_own_saves_and_asks_for_is_checked(
 ) -> None:
     path, shifted = tmp_path / "grounding.safetensors", Shifted(torch.ones(2))
     monkeypatch.setitem(KINDS, Shifted.kind, Shifted)
+    monkeypatch.setitem(KINDS, Lossy.kind, Shifted)
     monkeypatch.setattr(Shifted, "to_file", lambda self: ({"offset": self.shift.numpy()}, {}))
     with pytest.raises(BadInputError, match=r"^Shifted.to_file: 'offset' is a ndarray, expected a torch"):
         save_grounding(path, shifted, no_episodes())
@@ -112,6 +114,7 @@ SHIFTED = Shifted(torch.tensor([0.01]))
 @pytest.fixture
 def known(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(KINDS, Shifted.kind, Shifted)
+    monkeypatch.setitem(KINDS, Lossy.kind, Shifted)
 
 
 @pytest.mark.parametrize(
