@@ -8,6 +8,7 @@ import re
 import shlex
 import sys
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -24,7 +25,7 @@ from astra_data.dataset.versions import locate, names_at_home
 from astra_data.io.guessing import HEADING, Field, Logs, Role, csv_files, guess, logs_of
 from astra_data.pipeline.first_simulator import DIRECT, SimulatorKind, filled, first_simulator, unpacked
 
-_COLUMNS: dict[Role, str] = {"state": STATE, "command": ACTION, "goal": GOAL}
+_COLUMNS: dict[Role, str] = {"time": "time", "state": STATE, "command": ACTION, "goal": GOAL}
 _COLUMNS |= {"failure": TERMINATED, "success": SUCCESS, "reward": REWARD}
 _TAKEN = sys.stdlib_module_names | {"astra_data", "conftest", "logs", "numpy", "pytest", "torch"}
 """Names whose file would be found in place of a module, or is that of the mapping."""
@@ -222,7 +223,12 @@ def _column(role: Role, logs: Logs) -> str:
         called = f"{fields[0].name} is {fields[0].why.removesuffix(' (CHECK)')}"
         lines.insert(0, f"# CHECK: {called}: a failure? If a success, write next.success; if neither, delete this")
     lines.append(f"fields = {_code([field.name for field in fields])}")
-    if role in ("state", "command", "goal"):
+    if role == "time":  # in s since the first row, for `inspect`, where float32 can hold it
+        times = np.concatenate(logs.values(fields))
+        if np.spacing(np.float32(np.ptp(times))) > 0.01 / logs.rate:
+            return ""
+        fields = (replace(fields[0], short="time", unit="s", offset=float(-times[0, 0])),)
+    if role in ("time", "state", "command", "goal"):
         keys = {"names": "short", "unit": "unit", "scale": "scale", "offset": "offset"}
         lines += [f"{key} = {_code([getattr(field, of) for field in fields])}" for key, of in keys.items()]
     if role == "state" and "position" in (roles := _roles(fields)):

@@ -87,6 +87,7 @@ def test_a_flag_that_ends_logs_and_goals_are_imported(tmp_path: Path) -> None:
     command(f"import {logs} --mapping cart/logs.toml --out imported")
     data = Dataset.open("imported")
     assert ("position", slice(0, 2)) in data.specs([STATE])[0].roles  # a map can be drawn
+    assert data.specs(["time"])[0].units == ["s"] and "no time column" not in command("inspect imported")
     assert sum(bool(episode.columns[TERMINATED].any()) for episode in data.episodes([TERMINATED])) == 4
     objective = task_named("cart/cart.py:TASK").objective
     assert objective.goal_size == 2 and (objective.success_reward, objective.failure_reward) == (10.0, -10.0)
