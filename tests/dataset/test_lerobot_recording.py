@@ -141,6 +141,10 @@ def test_what_cannot_be_is_one_line(recorded: Path, tmp_path: Path) -> None:
     info.write_text(json.dumps(json.loads(info.read_text()) | {"codebase_version": "v2.1"}))
     with pytest.raises(BadInputError, match=r"format v2\.1, expected v3\.0: convert it"):
         Dataset.open(tmp_path / "old")
+    shutil.copytree(recorded / "arm", tmp_path / "torn")
+    (tmp_path / "torn/meta/tasks.parquet").write_bytes(b"PAR1")
+    with pytest.raises(CorruptDatasetError, match=r"altered: meta/tasks\.parquet "):
+        Dataset.open(tmp_path / "torn")
 
 
 @pytest.mark.parametrize(

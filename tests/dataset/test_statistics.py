@@ -11,7 +11,7 @@ from astra_data.dataset import statistics as episode_rows
 from astra_data.dataset import statistics as statistics
 from astra_data.dataset.columns import ACTION, REWARD, STATE, SUCCESS, Array, Column
 from astra_data.dataset.format import QUANTILES, STATISTICS
-from astra_data.dataset.statistics import EpisodeRows, episode_statistics
+from astra_data.dataset.statistics import EpisodeRows, Rounding, episode_statistics
 
 NAMES = (STATE, ACTION, REWARD, SUCCESS, "mode")
 
@@ -67,6 +67,27 @@ def test_ranges_of_blocks_are_those_of_the_whole() -> None:
         for key, value in found[name].items():
             np.testing.assert_allclose(value, expected[key], rtol=1e-12)
     assert statistics.ranges([]) == {}
+
+
+def told(*blocks: Array) -> tuple[str, bool] | None:
+    """Return what is found of rounding in `blocks` of a value y."""
+    found = Rounding(Column("position", size=1, names=("y",)))
+    for block in blocks:
+        found.add(block[:, None], block.astype(np.float32)[:, None])
+    return found.found()
+
+
+def test_steps_are_compared_with_those_that_float32_holds(monkeypatch: pytest.MonkeyPatch) -> None:
+    steps = np.arange(11.0)  # ten of them are enough
+    south = told(-4_429_530 - 0.63 * steps)
+    assert south is not None and "y (up to 4.42954e+06) in steps of 0.5, but it moves by 0.63" in south[0]
+    assert south[0].endswith("set offset = [4429533.0]") and told(-4_429_530 - 0.63 * steps[1:]) is None
+    counted = told(2.0**24 + steps)
+    assert counted is not None and not counted[1]
+    tiny = 2.0**-32 * steps
+    assert told(2.0**20 + 100 * tiny) is not None and told(2.0**20 + 10 * tiny) is None  # the noise of float64
+    monkeypatch.setattr(statistics, "_MOST_SAMPLES", 20)
+    assert told(np.full(11, 2.0**24), *[2.0**24 + 0.3 * steps] * 2) is not None
 
 
 COLUMNS = [Column("state", size=2), Column("flag", "bool")]

@@ -340,19 +340,19 @@ def test_the_latent_is_the_last_that_is_seen(has_maze: bool, latent_size: int) -
 
 def test_walls_are_seen_where_the_robot_and_where_the_simulator_goes() -> None:
     made = failure_model(has_maze=True)
-    # The upper corridor of the U-Maze: walls 2 m to the north and to the south.
-    state = torch.tensor([[0.0, 4.0, 0.0, 0.0]])
+    # The lower corridor of the U-Maze: walls 2 m to the north and to the south.
+    state = torch.tensor([[0.0, -4.0, 0.0, 0.0]])
     landed = state + torch.tensor([[0.0, 0.05, 0.0, 0.0]])  # 1 m/s to the north
-    inputs, _ = made.inputs(
-        *(state, torch.zeros(1, 2), landed, torch.zeros(1, 0)), made.initial_memory(state, torch.zeros(1, 2))
-    )
-    walls = inputs[0, 20:]
+    step = state, torch.zeros(1, 2), landed, torch.zeros(1, 0), made.initial_memory(state, torch.zeros(1, 2))
+    walls = made.inputs(*step)[0][0, 20:]
     to_wall = [float(U_MAZE.clearance(state[0, :2].double().numpy()))]
     for second in AHEAD_S:
         place = state[0, :2].double() + torch.tensor([0.0, second]).double()
         to_wall.append(float(U_MAZE.clearance(place.numpy())))
     assert walls[:6].tolist() == pytest.approx(to_wall, abs=0.11) and to_wall[5] < 0.2 < to_wall[1] < to_wall[0]
     assert walls[6:].tolist() == pytest.approx([to_wall[0]] * 5, abs=1e-5)
+    made.clearance.fill_(5.0)
+    assert made.inputs(*step)[0][0, 20:].tolist() == [3.0] * 11  # beyond, walls are alike
 
 
 def test_log_odds_are_scaled_and_shifted_to_what_happens() -> None:

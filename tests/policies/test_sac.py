@@ -7,6 +7,7 @@ import torch
 from torch import nn
 from toy_worlds import EndsAtZero, GoToZero, whole_and_resumed
 
+from astra_data.core.errors import BadInputError
 from astra_data.policies import sac as module
 from astra_data.policies.networks import PolicyShape, SoftActor, features_of
 from astra_data.policies.sac import Replay, Sac, SacConfig
@@ -22,6 +23,8 @@ def sac(env: BatchedEnv, steps: int, *, horizon: int, memory: int = 0, **setting
 
 
 def test_the_second_half_learns_ever_more_slowly() -> None:
+    with pytest.raises(BadInputError, match="buffer_size: expected at least 34 steps, for a window of 16 in 2 env"):
+        sac(GoToZero(2), 80, horizon=7, memory=8, buffer_size=33)
     learner = sac(GoToZero(8), 80, horizon=7, updates_per_step=1)
     rates = []
     while not learner.done:
