@@ -363,6 +363,12 @@ def test_log_odds_are_scaled_and_shifted_to_what_happens() -> None:
     for factor in (2.0, 0.5):
         scale, shift = calibration((factor * (true + 1.0)).expand(2, -1), happens, 1)
         assert float(scale) == pytest.approx(1 / factor, rel=0.05) and float(shift) == pytest.approx(-1.0, abs=0.05)
+    made = failure_model()
+    made.members.last_weight.zero_()
+    made.members.last_bias.copy_(torch.tensor([-2.0, 0.0, 4.0])[:, None, None])
+    made.log_odds_shift.fill_(0.5)
+    said = torch.tensor([-1.5, 0.5, 4.5]).sigmoid().mean()
+    torch.testing.assert_close(made.probability(torch.zeros(made.shape.input_size)), said)
 
 
 @pytest.mark.parametrize(("failing", "count"), [(1, 0), (2, 2), (4, 4), (13, 5)])
