@@ -368,7 +368,7 @@ def test_log_odds_are_scaled_and_shifted_to_what_happens() -> None:
     made.members.last_bias.copy_(torch.tensor([-2.0, 0.0, 4.0])[:, None, None])
     made.log_odds_shift.fill_(0.5)
     said = torch.tensor([-1.5, 0.5, 4.5]).sigmoid().mean()
-    torch.testing.assert_close(made.probability(torch.zeros(made.shape.input_size)), said)
+    torch.testing.assert_close(made.probability(torch.zeros(1, made.shape.input_size)), said[None])
 
 
 @pytest.mark.parametrize(("failing", "count"), [(1, 0), (2, 2), (4, 4), (13, 5)])
