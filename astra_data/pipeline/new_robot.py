@@ -62,12 +62,12 @@ def _dataset(logs: Sequence[Path]) -> Dataset | None:
         try:
             folder = locate(place)
         except BadInputError:
-            if not place.exists() and "@" not in place.name:
-                close = did_you_mean(str(place), names_at_home())
-                raise BadInputError(f"{place}: no such file, folder or dataset{close}") from None
-            if not place.exists():
+            if place.exists():
+                continue
+            if "@" in place.name:
                 raise
-            continue
+            close = did_you_mean(str(place), names_at_home())
+            raise BadInputError(f"{place}: no such file, folder or dataset{close}") from None
         folders += [folder] if folder != place or (folder / INFO_PATH).is_file() else []
     if folders and len(logs) > 1:
         raise BadInputError(
@@ -102,8 +102,7 @@ def _values(name: str, simulator: SimulatorKind) -> dict[str, str]:
         lines.append(f"| `{called}` | {one.taken_for} | {one.unit} | {one.scale:.4g} | {one.why} |")
     time = [f"time = {_code(field.name)}\ntime_scale = {field.scale!r}\n" for field in logs.of("time")]
     split = [f"field = {_code(field.name)}\n" for field in logs.of("episode")[:1]]
-    if time:
-        split.append(f"gap_s = {5 / logs.rate!r}  # a longer step begins a new episode\n")
+    split += [f"gap_s = {5 / logs.rate!r}  # a longer step begins a new episode\n"] * len(time)
     row, command = logs.values(states)[0][:1], logs.values(commands)[0][:1]
     first = simulator.episodes()[0][0][:1]
     given = np.concatenate(logs.values(commands))
