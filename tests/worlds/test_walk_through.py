@@ -89,6 +89,7 @@ class Own:
 
 
 WRONG: list[tuple[Task, str]] = [
+    (robot(step=lambda self, command: 1 / 0), "step of the robot fails with ZeroDivisionError"),
     (simulator(__init__=Own.single), "make_simulator(3).state, 3 states at once: expected shape (3, 1), got (1,)"),
     (simulator(reset_to=Own.deaf), "make_simulator: after reset_to(state), state: expected 3 in row 2, entry 0, got 0"),
     (
