@@ -220,6 +220,7 @@ def test_copies_make_up_the_episodes_that_are_asked_for_and_the_odd_ones_are_of_
     copies = shares(episodes=23, held_out_share=0.2)[1]
     assert copies.sum() == 13 and np.ptp(copies[copies > 0]) <= 1
     assert shares(episodes=23, held_out_share=0.2, keep_originals=False)[1].sum() == 21
+    assert shares(episodes=10, held_out_share=0.2)[1].sum() == 0
     more = [shares(seed, episodes=11, held_out_share=0.2)[1].argmax() for seed in range(20)]
     assert len(set(more)) > 5
 
