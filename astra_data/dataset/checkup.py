@@ -31,7 +31,6 @@ class Finding:
     episodes: tuple[int, ...] = ()  # uids of the episodes where it is; empty if it concerns the whole dataset
 
     def __str__(self) -> str:
-        """Say it in a line."""
         word = "episode" if len(self.episodes) == 1 else "episodes"
         where = f" ({word} {first_few(self.episodes, SHOWN)})" if self.episodes else ""
         return f"{self.severity}: {self.what}{where}: {self.advice}"
@@ -159,7 +158,6 @@ class Clock:
         return period_s, gaps, gaps / len(steps_s), jitter
 
     def __str__(self) -> str:
-        """Compare the rates."""
         declared, (period_s, gaps, share, jitter) = f"{self.fps} Hz declared", self.rates()
         if not period_s:
             return f"{declared}; {self.name} does not increase in most steps"

@@ -40,7 +40,6 @@ class Order:
         self.epoch = self.batch = 0
 
     def __len__(self) -> int:
-        """Return the number of batches in an epoch."""
         return self._batches
 
     def __iter__(self) -> Iterator[Tensor]:
@@ -80,7 +79,6 @@ class Samples(data.Dataset[Batch]):
         self._first, self._gather, self._device = first, gather, device
 
     def __len__(self) -> int:
-        """Return the number of samples M."""
         return len(self._first)
 
     def __getitem__(self, index: int) -> Batch:
@@ -107,11 +105,9 @@ class Batches:
         self.state_dict, self.load_state_dict = order.state_dict, order.load_state_dict
 
     def __len__(self) -> int:
-        """Return the number of batches in an epoch."""
         return len(self.order)
 
     def __iter__(self) -> Iterator[Batch]:
-        """Yield the batches that are left of this epoch."""
         return map(self.samples.__getitems__, self.order)
 
 
@@ -194,7 +190,6 @@ class Frames:
         return int(self.lengths.sum())
 
     def __repr__(self) -> str:
-        """Show sizes and columns."""
         columns = ", ".join(f"{name} {tuple(values.shape[1:])}" for name, values in self.columns.items())
         return f"Frames({len(self.lengths)} episodes, {len(self)} steps, {columns}, to {self.device})"
 

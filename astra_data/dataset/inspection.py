@@ -59,7 +59,6 @@ class Endings:
             self.made_up += ended and stands_still(columns[STATE][-1], columns[NEXT_STATE][-1])
 
     def __str__(self) -> str:
-        """Summarize them in a line."""
         made_up = f"; {self.made_up} next states of terminated episodes were made up: the state itself is used"
         return f"{self.terminated} terminated, {self.cut_off} cut off{made_up if self.made_up else ''}"
 

@@ -70,7 +70,6 @@ class Run:
     columns: Mapping[str, Array]
 
     def __len__(self) -> int:
-        """Return T."""
         return len(self.columns[names.EPISODE_INDEX])
 
 

@@ -87,13 +87,13 @@ class Descent:
         self.parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
         self._optimizer = torch.optim.AdamW(self.parameters, config.learning_rate, weight_decay=weight_decay)
         self._schedule = torch.optim.lr_scheduler.CosineAnnealingLR(self._optimizer, config.updates)
+        self._parts: dict[str, Any] = {"model": model, "optimizer": self._optimizer, "schedule": self._schedule}
         self._logbook = Logbook(checkpoint, self._go_on)
         self.points, self.stopwatch = self._logbook.points, self._logbook.stopwatch
 
     def _go_on(self, state: dict[str, Any]) -> None:
-        self._model.load_state_dict(state["model"])
-        self._optimizer.load_state_dict(state["optimizer"])
-        self._schedule.load_state_dict(state["schedule"])
+        for name, part in self._parts.items():
+            part.load_state_dict(state[name])
         self.done, self.best, self._least, self._weights = (state[k] for k in ("done", "best", "least", "weights"))
 
     @property
@@ -127,17 +127,9 @@ class Descent:
         if held_out_error is not None and held_out_error < self._least:
             self._least, self.best = held_out_error, self.done
             self._weights = copy.deepcopy(self._model.state_dict())
-        self._logbook.keep(
-            {
-                "model": self._model.state_dict(),
-                "optimizer": self._optimizer.state_dict(),
-                "schedule": self._schedule.state_dict(),
-                "done": self.done,
-                "best": self.best,
-                "least": self._least,
-                "weights": self._weights,
-            }
-        )
+        parts = {name: part.state_dict() for name, part in self._parts.items()}
+        so_far = {"done": self.done, "best": self.best, "least": self._least, "weights": self._weights}
+        self._logbook.keep(parts | so_far)
 
     def finish(self) -> None:
         """Return to the weights with the least held-out error, if it was measured."""

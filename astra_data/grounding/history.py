@@ -24,7 +24,6 @@ class GroundedSimulator(EpisodeSimulator):
     """Step the simulator, correct where it landed, set it there; `hidden` (B, M) is the encoder's memory."""
 
     def __init__(self, simulator: PlacedSimulator, grounding: "HistoryGrounding") -> None:
-        """Wrap `simulator`."""
         super().__init__(simulator)
         # States are `blocked` where their correction touches a wall, not their scatter.
         self._touches: Tensor | None = simulator.blocked if grounding.fails_at_walls else None

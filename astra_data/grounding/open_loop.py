@@ -101,7 +101,6 @@ class Moments:
         return cls(windows, episode, number * steps)
 
     def __len__(self) -> int:
-        """Return their number N."""
         return len(self.first)
 
     @property

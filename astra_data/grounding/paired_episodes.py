@@ -172,7 +172,6 @@ class PairedEpisodes:
             raise BadInputError(f"{self.reference} {'; '.join(faults)}: pair it again, with the simulator of this task")
 
     def __len__(self) -> int:
-        """Return the number of episodes E."""
         return len(self.target_state)
 
     @property

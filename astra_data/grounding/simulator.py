@@ -20,7 +20,6 @@ class EpisodeSimulator:
     landed: Tensor  # where the simulator landed in the last step, before any correction, (B, X)
 
     def __init__(self, simulator: PlacedSimulator) -> None:
-        """Wrap `simulator`."""
         self.simulator, self.landed = simulator, simulator.state
         self._varied = simulator if isinstance(simulator, VariedSimulator) else None
         inner: object = simulator

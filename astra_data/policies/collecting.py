@@ -58,7 +58,6 @@ class WallWatch:
     """Predicts with the abstract simulator how close to walls commands lead within a second."""
 
     def __init__(self, task: Task, clearance_m: float) -> None:
-        """Keep robots `clearance_m` away from the walls of the task's maze."""
         self.clearance_m, self._task, self._maze = clearance_m, task, task.maze
 
     def clearance(self, state: Tensor, commands: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -100,7 +100,6 @@ class BatchedVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012 - as Gymnasium declares it
 
     def __init__(self, env: SeededEnv, max_episode_steps: int) -> None:
-        """Wrap `env`; its episodes are truncated after `max_episode_steps`."""
         self.env = env
         self.num_envs = env.num_envs
         self.max_episode_steps = max_episode_steps

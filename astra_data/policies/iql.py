@@ -120,7 +120,6 @@ class Iql:
     """A training in progress, after so many `updates` of critics and policy."""
 
     def __init__(self, policy: Policy, experience: Experience, config: IqlConfig, *, seed: int) -> None:
-        """Prepare to train `policy` in place on `experience`, with all randomness from `seed`."""
         self.policy, self.config, self.seed = policy, config, seed
         self.updates = 0
         self._experience = experience
@@ -136,6 +135,8 @@ class Iql:
         learned = [*self._critics.value.parameters(), *fast.parameters()]
         self._critic_optimizer = torch.optim.Adam(learned, lr=_CRITIC_LEARNING_RATE, fused=True)
         self._optimizer = torch.optim.Adam(self._policy_parameters, lr=config.learning_rate, fused=True)
+        self._parts: dict[str, Any] = {"critics": self._critics, "policy": policy}
+        self._parts |= {"critic_optimizer": self._critic_optimizer, "optimizer": self._optimizer}
         self._weights: Tensor | None = None
 
     @property
@@ -209,20 +210,12 @@ class Iql:
 
     def state_dict(self) -> dict[str, Any]:
         """Return all that `load_state_dict` needs to continue from here."""
-        return {
-            "critics": self._critics.state_dict(),
-            "policy": self.policy.state_dict(),
-            "critic_optimizer": self._critic_optimizer.state_dict(),
-            "optimizer": self._optimizer.state_dict(),
-            "updates": self.updates,
-        }
+        return {name: part.state_dict() for name, part in self._parts.items()} | {"updates": self.updates}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from `state`."""
-        self._critics.load_state_dict(state["critics"])
-        self.policy.load_state_dict(state["policy"])
-        self._critic_optimizer.load_state_dict(state["critic_optimizer"])
-        self._optimizer.load_state_dict(state["optimizer"])
+        for name, part in self._parts.items():
+            part.load_state_dict(state[name])
         self.updates, self._weights = state["updates"], None
 
 

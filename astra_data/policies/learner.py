@@ -92,11 +92,6 @@ class Learner(ABC):
         """Whether the training is over."""
         return self.share >= 1.0 - _ROUNDING
 
-    @property
-    def share_left(self) -> float:
-        """Share of the training that is not done yet."""
-        return 1.0 - self.share
-
     def iterate(self) -> dict[str, float]:
         """Take `rollout_steps` batched steps and learn; return `figures`, and the learner's own."""
         torch.manual_seed(derive(self._seed, f"iteration {self._iteration}"))

@@ -48,7 +48,6 @@ class Ppo(Learner):
     """A training in progress."""
 
     def __init__(self, env: BatchedEnv, policy: ActorCritic, config: PpoConfig, *, horizon: int, seed: int) -> None:
-        """Prepare to train `policy` in `env`, with episodes of at most `horizon` steps."""
         if env.num_envs * config.rollout_steps == 1:
             raise BadInputError("rollout_steps: expected 2 or more in a single environment, got 1")
         self.policy, self.config = policy, config
@@ -72,9 +71,9 @@ class Ppo(Learner):
     def _iterate(self) -> dict[str, float]:
         """Collect one rollout and learn from it; return the mean "std" of the actions."""
         for group in self._optimizer.param_groups:
-            group["lr"] = self.config.learning_rate * self.share_left
+            group["lr"] = self.config.learning_rate * (1.0 - self.share)
         self._learn(self._collect())
-        faded = min(1.0, (1.0 - self.share_left) / _FADE_SHARE)
+        faded = min(1.0, (1.0 - (1.0 - self.share)) / _FADE_SHARE)
         with torch.no_grad():
             self.policy.log_std.clamp_(max=math.log(self._first_std) + faded * math.log(_FINAL_STD / self._first_std))
         figures = {"std": float(self.policy.log_std.detach().exp().mean())}
@@ -178,7 +177,6 @@ class ReturnScale:
     """The running deviation of discounted sums of B rows' rewards, as in VecNormalize of OpenAI Baselines."""
 
     def __init__(self, num_envs: int, discount: float, device: torch.device) -> None:
-        """Begin with nothing seen."""
         self.discount = discount
         self.sums = torch.zeros(num_envs, device=device)
         self.count, self.mean, self.var = torch.tensor([1e-4, 0.0, 1.0], dtype=torch.float64, device=device)

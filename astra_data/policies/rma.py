@@ -35,7 +35,6 @@ class Adaptation(Learner):
     def __init__(
         self, env: BatchedEnv, teacher: Teacher, config: RmaConfig, *, rollout_steps: int, horizon: int, seed: int
     ) -> None:
-        """Prepare to train a student of `teacher` in `env`, the environment that it was trained in."""
         self.teacher, self.config = teacher, config
         torch.manual_seed(derive(seed, "student"))
         self.student = Student.of_teacher(teacher)
@@ -54,7 +53,7 @@ class Adaptation(Learner):
     def _iterate(self) -> dict[str, float]:
         """Take `rollout_steps` batched steps, learning after each; return the estimates' R² as "r2_extrinsics"."""
         for group in self._optimizer.param_groups:
-            group["lr"] = self.config.adaptation_learning_rate * self.share_left
+            group["lr"] = self.config.adaptation_learning_rate * (1.0 - self.share)
         errors, true = [], []
         for _ in range(self.rollout_steps):
             extrinsics, features, hidden = self._learn()

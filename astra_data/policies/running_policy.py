@@ -57,7 +57,6 @@ class UserPolicy(Policy):
     """A policy of another learner, in the place of one that was trained here; it has no memory."""
 
     def __init__(self, acting: ActingPolicy, observation_size: int, action_size: int) -> None:
-        """Let `acting` act on observations (B, O)."""
         super().__init__(PolicyShape(observation_size, action_size))
         if not callable(getattr(acting, "act", None)):
             raise BadInputError(f"{type(acting).__name__} is no policy: expected act(observation) -> action")

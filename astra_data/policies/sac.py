@@ -62,7 +62,6 @@ class Sac(Learner):
     """A training in progress, of the actor `policy`."""
 
     def __init__(self, env: BatchedEnv, policy: SoftActor, config: SacConfig, *, horizon: int, seed: int) -> None:
-        """Prepare to train `policy` in `env`, with episodes of at most `horizon` steps."""
         self.policy, self.config = policy, config
         torch.manual_seed(derive(seed, "critics"))
         device = next(policy.parameters()).device
@@ -100,7 +99,7 @@ class Sac(Learner):
     def _iterate(self) -> dict[str, float]:
         """Take `rollout_steps` batched steps, learning after each; return the entropy's "temperature"."""
         for group in self._optimizer.param_groups:
-            group["lr"] = self.config.learning_rate * min(1.0, 2.0 * self.share_left)
+            group["lr"] = self.config.learning_rate * min(1.0, 2.0 * (1.0 - self.share))
         for _ in range(self.rollout_steps):
             self._act()
             if len(self._replay) > self._window:
@@ -201,7 +200,6 @@ class Replay:
             self._columns[name] = torch.empty(place, dtype=torch.bool, device=device)
 
     def __len__(self) -> int:
-        """Return the number of steps held per row."""
         return min(self._added, self._rows)
 
     def add(self, **step: Tensor) -> None:

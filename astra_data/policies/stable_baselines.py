@@ -22,7 +22,6 @@ class StableBaselinesEnv(VecEnv):
     """
 
     def __init__(self, env: VectorEnv[Array, Array, Array]) -> None:
-        """Show `env`, which starts finished rows anew in the same step."""
         self.env = env
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 

@@ -157,7 +157,6 @@ class Task:
     derived: Mapping[str, Any] = field(default_factory=dict, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        """Fill in the defaults."""
         for one in fields(self):
             if one.name in self.derived and getattr(self, one.name) is self.derived[one.name]:
                 object.__setattr__(self, one.name, one.default)

@@ -192,7 +192,7 @@ class BatchedNao:
         rng = np.random.default_rng(seed)
         self.traits = walk.Traits.draw(self.spread, num_robots, rng)
         self.gait = walk.Gait.standing(num_robots, self._limits)
-        self._engine = walk.WalkEngine(walk.StepPlanner(self.traits.quality, self._limits), style)
+        self._engine = walk.WalkEngine(self.traits.quality, self._limits, style)
         self.bodies = BatchedBodies(
             nao_model(maze, ball=ball),
             self.traits,

@@ -4,7 +4,7 @@ Poses of feet are those of soles in the torso's frame: x, y, z in m, roll, pitch
 it takes the mean of what each foot needs; the other joints keep the soles' positions and planes exact.
 """
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 
 import numpy as np
@@ -197,75 +197,6 @@ class Gait:
 
 
 @dataclass(frozen=True)
-class StepPlanner:
-    """Plans the steps of B robots."""
-
-    quality: Floats  # factor on a robot's top speeds, (B,): 1 new, 0.83 worn (B-Human's two sets of limits)
-    limits: WalkLimits = field(default_factory=WalkLimits)
-
-    def attainable(self, command: Floats) -> Floats:
-        """Return `command` (B, 3), m/s, m/s, rad/s, reduced to velocities that can be walked, (B, 3)."""
-        limits, quality = self.limits, self.quality
-        x, y, turn = command.T
-        turn = np.clip(turn, -limits.turn_rad_s * quality, limits.turn_rad_s * quality)
-        per_step = 2 * turn * limits.step_s * limits.wide_turn
-        top_x = np.where(x > 0, limits.forward_m_s, limits.backward_m_s) * quality
-        top_y = limits.sideways_m_s * quality
-        top_x = top_x * np.clip(1 - (per_step / limits.forward_stops_at_turn_rad) ** 2, 0, 1)
-        top_y = top_y * np.clip(1 - (per_step / limits.sideways_stops_at_turn_rad) ** 2, 0, 1)
-        x, y = np.clip(x, -top_x, top_x), np.clip(y, -top_y, top_y)
-        share_x = np.divide(x, top_x, out=np.zeros_like(x), where=top_x > 0)
-        share_y = np.divide(y, top_y, out=np.zeros_like(y), where=top_y > 0)
-        excess = np.maximum(np.hypot(share_x, share_y), 1.0)
-        x, y = x / excess, y / excess
-        return np.stack([x, y, turn], axis=1)
-
-    def advance(self, gait: Gait, command: Floats, seconds: float, on_the_spot: Bools | None = None) -> Bools:
-        """Advance `gait` in place, planning steps by `command` (B, 3), zero for rest; return which began one, (B,)."""
-        gait.phase = np.where(gait.walking, gait.phase + seconds / gait.duration_s, 0.0)
-        called = (command != 0).any(axis=1)
-        if on_the_spot is not None:
-            called |= on_the_spot
-        landed = gait.walking & (gait.phase >= 1)
-        rests = landed & ~called & (gait.kind == STOP)
-        begins = (landed & ~rests) | (~gait.walking & called)
-        if landed.any() or begins.any():
-            self._plan(gait, command, called, begins)
-            gait.phase = np.where(landed, gait.phase - 1, gait.phase) * ~rests
-            gait.walking = (gait.walking & ~rests) | begins
-        return np.asarray(begins)
-
-    def _plan(self, gait: Gait, command: Floats, called: Bools, begins: Bools) -> None:
-        limits = self.limits
-        x, y, turn = self.attainable(command).T
-        x = _nearer_zero_or_up_to(gait.forward_m_s, x, limits.slow_down_m_s, limits.speed_up_m_s)
-        closed = (gait.after == 0).all(axis=1)
-        kind = np.where(gait.kind == STOP, START, np.where(closed & ~called, STOP, STRIDE))
-        # The first stride is that of the foot on the side that the command leads to.
-        sideways = np.where(y != 0, y, turn)
-        left_swings = np.where((kind == START) & (sideways != 0), sideways < 0, ~gait.left_swings)
-        leads_y, leads_turn = left_swings == (y > 0), left_swings == (turn > 0)
-        duration = limits.step_s + limits.step_s_per_sideways_m_s * np.abs(y)
-        turn_share = np.where(leads_turn, limits.wide_turn, 1 - limits.wide_turn)
-        after = np.stack([x * duration, 2 * y * duration * leads_y, 2 * turn * duration * turn_share], axis=1)
-        after *= (kind == STRIDE)[:, None]
-        gait.before = np.where(begins[:, None], gait.after, gait.before)
-        gait.after = np.where(begins[:, None], after, gait.after)
-        gait.left_swings = np.where(begins, left_swings, gait.left_swings)
-        gait.kind = np.where(begins, kind, gait.kind)
-        gait.duration_s = np.where(begins, duration, gait.duration_s)
-        gait.forward_m_s = np.where(begins, x * (kind == STRIDE), gait.forward_m_s)
-
-
-def _nearer_zero_or_up_to(speed: Floats, wanted: Floats, loss: float, gain: float) -> Floats:
-    """Return `wanted` (B,), limited to `gain` away from zero and `loss` toward it from `speed` (B,)."""
-    direction = np.where(speed != 0, np.sign(speed), np.sign(wanted))
-    along = np.clip(wanted * direction, np.abs(speed) - loss, np.abs(speed) + gain)
-    # Beyond zero the limit of a gain holds again.
-    return np.asarray(direction * np.maximum(along, -gain))
-
-
-@dataclass(frozen=True)
 class WalkStyle:
     """Parameters of the motion; ours where no source is named."""
 
@@ -307,8 +238,62 @@ class Targets:
 class WalkEngine:
     """Walks B robots."""
 
-    planner: StepPlanner
+    quality: Floats  # factor on a robot's top speeds, (B,): 1 new, 0.83 worn (B-Human's two sets of limits)
+    limits: WalkLimits
     style: WalkStyle
+
+    def attainable(self, command: Floats) -> Floats:
+        """Return `command` (B, 3), m/s, m/s, rad/s, reduced to velocities that can be walked, (B, 3)."""
+        limits, quality = self.limits, self.quality
+        x, y, turn = command.T
+        turn = np.clip(turn, -limits.turn_rad_s * quality, limits.turn_rad_s * quality)
+        per_step = 2 * turn * limits.step_s * limits.wide_turn
+        top_x = np.where(x > 0, limits.forward_m_s, limits.backward_m_s) * quality
+        top_y = limits.sideways_m_s * quality
+        top_x = top_x * np.clip(1 - (per_step / limits.forward_stops_at_turn_rad) ** 2, 0, 1)
+        top_y = top_y * np.clip(1 - (per_step / limits.sideways_stops_at_turn_rad) ** 2, 0, 1)
+        x, y = np.clip(x, -top_x, top_x), np.clip(y, -top_y, top_y)
+        share_x = np.divide(x, top_x, out=np.zeros_like(x), where=top_x > 0)
+        share_y = np.divide(y, top_y, out=np.zeros_like(y), where=top_y > 0)
+        excess = np.maximum(np.hypot(share_x, share_y), 1.0)
+        x, y = x / excess, y / excess
+        return np.stack([x, y, turn], axis=1)
+
+    def tick(self, gait: Gait, command: Floats, on_the_spot: Bools | None = None) -> Bools:
+        """Advance `gait` in place, planning steps by `command` (B, 3), zero for rest; return which began one, (B,)."""
+        gait.phase = np.where(gait.walking, gait.phase + TICK_S / gait.duration_s, 0.0)
+        called = (command != 0).any(axis=1)
+        if on_the_spot is not None:
+            called |= on_the_spot
+        landed = gait.walking & (gait.phase >= 1)
+        rests = landed & ~called & (gait.kind == STOP)
+        begins = (landed & ~rests) | (~gait.walking & called)
+        if landed.any() or begins.any():
+            self._plan(gait, command, called, begins)
+            gait.phase = np.where(landed, gait.phase - 1, gait.phase) * ~rests
+            gait.walking = (gait.walking & ~rests) | begins
+        return np.asarray(begins)
+
+    def _plan(self, gait: Gait, command: Floats, called: Bools, begins: Bools) -> None:
+        limits = self.limits
+        x, y, turn = self.attainable(command).T
+        x = _nearer_zero_or_up_to(gait.forward_m_s, x, limits.slow_down_m_s, limits.speed_up_m_s)
+        closed = (gait.after == 0).all(axis=1)
+        kind = np.where(gait.kind == STOP, START, np.where(closed & ~called, STOP, STRIDE))
+        # The first stride is that of the foot on the side that the command leads to.
+        sideways = np.where(y != 0, y, turn)
+        left_swings = np.where((kind == START) & (sideways != 0), sideways < 0, ~gait.left_swings)
+        leads_y, leads_turn = left_swings == (y > 0), left_swings == (turn > 0)
+        duration = limits.step_s + limits.step_s_per_sideways_m_s * np.abs(y)
+        turn_share = np.where(leads_turn, limits.wide_turn, 1 - limits.wide_turn)
+        after = np.stack([x * duration, 2 * y * duration * leads_y, 2 * turn * duration * turn_share], axis=1)
+        after *= (kind == STRIDE)[:, None]
+        gait.before = np.where(begins[:, None], gait.after, gait.before)
+        gait.after = np.where(begins[:, None], after, gait.after)
+        gait.left_swings = np.where(begins, left_swings, gait.left_swings)
+        gait.kind = np.where(begins, kind, gait.kind)
+        gait.duration_s = np.where(begins, duration, gait.duration_s)
+        gait.forward_m_s = np.where(begins, x * (kind == STRIDE), gait.forward_m_s)
 
     def advance(self, gait: Gait, command: Floats, ticks: int, kick: Bools | None = None) -> Targets:
         """Walk on at `command` (B, 3) for `ticks`, changing `gait`; feet that are to `kick` (B, 2) do in a swing."""
@@ -317,7 +302,7 @@ class WalkEngine:
             kick = np.zeros((len(command), 2), dtype=bool)
         steps_on = np.asarray(kick.any(axis=1))
         for _ in range(ticks):
-            begins = self.planner.advance(gait, command, TICK_S, steps_on)
+            begins = self.tick(gait, command, steps_on)
             kicks = np.where(gait.left_swings, kick[:, 0], kick[:, 1])
             gait.kicking = np.where(begins, kicks & (gait.kind == STRIDE), gait.kicking)
             feet.append(self.feet(gait))
@@ -366,3 +351,11 @@ class WalkEngine:
         rest = throw * gait.phase * (1 - gait.phase)
         shift = rest * np.where(gait.kind == START, gait.phase, 1 - gait.phase)
         return np.asarray(gait.walking * np.where(gait.kind == STRIDE, straight - swing, shift))
+
+
+def _nearer_zero_or_up_to(speed: Floats, wanted: Floats, loss: float, gain: float) -> Floats:
+    """Return `wanted` (B,), limited to `gain` away from zero and `loss` toward it from `speed` (B,)."""
+    direction = np.where(speed != 0, np.sign(speed), np.sign(wanted))
+    along = np.clip(wanted * direction, np.abs(speed) - loss, np.abs(speed) + gain)
+    # Beyond zero the limit of a gain holds again.
+    return np.asarray(direction * np.maximum(along, -gain))

@@ -24,7 +24,6 @@ class Maze:
     fine_m: float = 0.1  # cell size of the fine grid for clearances and distances; divides the scale
 
     def __post_init__(self) -> None:
-        """Check the maze."""
         faults = []
         if not self.rows or not self.rows[0] or len({len(row) for row in self.rows}) != 1:
             faults.append("rows: expected strings of one length")

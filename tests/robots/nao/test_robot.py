@@ -64,7 +64,7 @@ def test_shanks_and_feet_touch_the_ball_and_the_chest_does_not(part: str) -> Non
 
 STYLE = legs.WalkStyle(gyro_gain=(0.0, 0.0))
 STANDING = legs.leg_angles(
-    legs.WalkEngine(legs.StepPlanner(np.ones(1)), STYLE).feet(legs.Gait.standing(1, legs.WalkLimits()))
+    legs.WalkEngine(np.ones(1), legs.WalkLimits(), STYLE).feet(legs.Gait.standing(1, legs.WalkLimits()))
 )[0]
 FIRST = 3  # the longest delay: so many angles are under way when a control step begins
 

@@ -58,8 +58,8 @@ def test_each_trait_has_its_own_range() -> None:
 LIMITS = walk.WalkLimits()
 
 
-def planner(*quality: float) -> walk.StepPlanner:
-    return walk.StepPlanner(np.array(quality))
+def planner(*quality: float) -> walk.WalkEngine:
+    return walk.WalkEngine(np.array(quality), LIMITS, walk.WalkStyle())
 
 
 def one(*command: float) -> Floats:
@@ -71,7 +71,7 @@ def strides(command: Floats, seconds: float, gait: walk.Gait | None = None) -> l
     gait = gait or walk.Gait.standing(1, LIMITS)
     seen = []
     for _ in range(round(seconds / walk.TICK_S)):
-        begins = planner(1.0).advance(gait, command, walk.TICK_S)
+        begins = planner(1.0).tick(gait, command)
         if begins[0] and gait.kind[0] == walk.STRIDE:
             seen.append(walk.Gait(**{name: value.copy() for name, value in vars(gait).items()}))
     return seen
@@ -128,7 +128,7 @@ def test_walking_begins_and_ends_with_a_shift_of_weight() -> None:
     gait, kinds = walk.Gait.standing(1, LIMITS), []
     for tick in range(200):
         command = one(0.1, 0, 0) if tick < 100 else one(0, 0, 0)
-        if planner(1.0).advance(gait, command, walk.TICK_S)[0]:
+        if planner(1.0).tick(gait, command)[0]:
             kinds.append(int(gait.kind[0]))
     assert kinds[0] == walk.START and kinds[-1] == walk.STOP and set(kinds[1:-1]) == {walk.STRIDE}
     assert not gait.walking[0] and (gait.after == 0).all()
@@ -138,7 +138,7 @@ STYLE = walk.WalkStyle(step_scale=(1.0, 1.0, 1.0))
 
 
 def engine(count: int = 1, style: walk.WalkStyle = STYLE) -> walk.WalkEngine:
-    return walk.WalkEngine(walk.StepPlanner(np.ones(count), LIMITS), style)
+    return walk.WalkEngine(np.ones(count), LIMITS, style)
 
 
 def striding(**changes: object) -> walk.Gait:
@@ -190,7 +190,7 @@ def test_targets_are_the_angles_of_the_planned_feet_tick_by_tick() -> None:
     targets = engine().advance(walking, command, 40)
     assert targets.angles.shape == (1, 40, 11) and len(targets.gaits) == 41
     for tick in range(40):
-        engine().planner.advance(again, command, walk.TICK_S)
+        engine().tick(again, command)
         np.testing.assert_allclose(
             foot_poses(targets.angles[0, tick])[:, :5], engine().feet(again)[0][:, :5], atol=1e-9
         )
