@@ -252,9 +252,7 @@ class PolicyFile:
                 policy = loaded(made(shaped(**shape)), weights, device)
             if recorded := metadata.get("simulation"):
                 variation = recorded["variation"]
-                simulation = Simulation(
-                    WorldConfig(**recorded["world"]), Variation.of_json(variation) if variation else None
-                )
+                simulation = Simulation(WorldConfig(**recorded["world"]), variation and Variation.of_json(variation))
             return cls(policy, simulation, metadata["dataset"], metadata["hash"], metadata["observed"])
 
 

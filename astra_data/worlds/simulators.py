@@ -125,11 +125,7 @@ def add_walls(world: ElementTree.Element, maze: Maze, height: float, **attribute
 
 def wall_geoms(model: mujoco.MjModel) -> tuple[int, int] | None:
     """Return the first and last geom id of the maze walls (ids are contiguous), or None on an open plane."""
-    walls = [
-        geom
-        for geom in range(model.ngeom)
-        if mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, geom).startswith("block_")
-    ]
+    walls = [geom for geom in range(model.ngeom) if model.geom(geom).name.startswith("block_")]
     return (walls[0], walls[-1]) if walls else None
 
 

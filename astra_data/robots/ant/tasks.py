@@ -164,7 +164,6 @@ class AntMazeEnv(PhysicsTarget, PlanarTarget):
     ) -> None:
         """Build B ants; `leg_scale` is a factor on the legs' length, `controller` by default the one shipped."""
         super().__init__(objective, num_envs, start_anywhere=start_anywhere)
-        self.leg_scale = leg_scale
         self.controller = controller or VelocityController.load()
         model = ant_model(objective.maze, leg_scale=leg_scale)
         self.physics = BatchedPhysics(

@@ -170,6 +170,7 @@ class HumanoidEnv(PhysicsTarget):
         )
         self.goal = torch.zeros(num_envs, 0)
         self.failed = torch.zeros(num_envs, dtype=torch.bool)
+        self.wall_contact = torch.zeros(num_envs, dtype=torch.bool)  # there are no walls
         self.reseed(seed)
 
     def _measure(self, data: mujoco.MjData) -> tuple[float, float, float]:
@@ -183,11 +184,6 @@ class HumanoidEnv(PhysicsTarget):
     def position(self) -> Tensor:
         """Positions of the humanoids, (B, 2) float32 in m."""
         return self.state[:, :2]
-
-    @property
-    def wall_contact(self) -> Tensor:
-        """All false, for there are no walls: (B,) bool."""
-        return torch.zeros(self.num_envs, dtype=torch.bool)
 
     def reseed(self, seed: int) -> None:
         """Restart the random numbers of starts at `seed`."""

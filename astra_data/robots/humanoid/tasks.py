@@ -114,13 +114,8 @@ class MassWalking(Walking):
     """Walking of joints, center of mass and the torso's lean, states (..., 46)."""
 
     spread = (
-        *JointWalking.spread,
-        *(
-            [humanoid.POSITION_M] * 3
-            + [humanoid.VELOCITY_M_S] * 3
-            + [humanoid.LEAN_RAD] * 3
-            + [humanoid.SPIN_RAD_S] * 3
-        ),
+        *(*JointWalking.spread, *[humanoid.POSITION_M] * 3, *[humanoid.VELOCITY_M_S] * 3),
+        *(*[humanoid.LEAN_RAD] * 3, *[humanoid.SPIN_RAD_S] * 3),
     )
     phi = abstraction.humanoid_to_extended_kinematics
 
@@ -209,10 +204,9 @@ have another one, it is read as factors around theirs."""
 Kind = type[HumanoidWalker2d] | type[HumanoidKinematics]
 Quantities = dict[str, tuple[int, ...]]
 
-_ALL = [*range(2 * _COUNT + 12)]
-_JOINT_QUANTITIES = {"joints_rad": (*_ALL[:_COUNT],), "joint_rates_rad_s": (*_ALL[_COUNT : 2 * _COUNT],)}
+_JOINT_QUANTITIES = {"joints_rad": (*range(_COUNT),), "joint_rates_rad_s": (*range(_COUNT, 2 * _COUNT),)}
 _BODY_QUANTITIES = {
-    name: (*_ALL[2 * _COUNT + first : 2 * _COUNT + first + 3],)
+    name: (*range(2 * _COUNT + first, 2 * _COUNT + first + 3),)
     for name, first in {"mass_m": 0, "mass_velocity_m_s": 3, "up": 6, "spin_rad_s": 9}.items()
 }
 _WALKER_QUANTITIES: Quantities = {
