@@ -109,6 +109,7 @@ def test_the_vector_env_speaks_as_gymnasiums_own() -> None:
                 np.testing.assert_array_equal(final["_success"], terminated)
                 assert infos["final_obs"][rows[0]].shape == (8,) and infos["final_obs"].dtype == object
                 assert all(infos["final_obs"][row] is None for row in np.flatnonzero(~terminated))
+                assert np.abs(observation[rows[0]] - infos["final_obs"][rows[0]]).max() > 0.5  # it starts anew
                 successes += len(rows)
         assert successes == 2
 
@@ -128,6 +129,8 @@ def test_a_grounded_simulator_shows_its_latents() -> None:
         np.testing.assert_allclose(np.linalg.norm(first[:, :16], axis=1), 1.0, rtol=1e-3)
         command = np.full((3, 2), 0.5, dtype=np.float32)
         first, expected = env.step(command)[0], raw.step(command)[0]
+    ends = [env.step(command)[3].all() for _ in range(7)]
+    assert ends == [True, False, False, False, False, True, False]  # each episode has five steps
 
 
 def test_rows_are_those_of_the_vector_environment() -> None:

@@ -15,9 +15,20 @@ from astra_data.core.progress import Progress, silent
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.model import GroundingModel, GroundingShape
 from astra_data.grounding.simulator import NO_GROUNDING, Grounding
+from astra_data.policies.episodes import Reached
+from astra_data.policies.networks import ActorCritic, ActorCriticShape
 from astra_data.policies.ppo import Ppo
-from astra_data.policies.simulator_env import RewardSource, WorldConfig
-from astra_data.policies.train import AnyTrainConfig, InSimulator, PpoTrainConfig, SacTrainConfig, Training, optimize
+from astra_data.policies.running_policy import PolicyFile
+from astra_data.policies.simulator_env import RewardSource, Simulation, WorldConfig
+from astra_data.policies.train import (
+    AnyTrainConfig,
+    InSimulator,
+    PpoTrainConfig,
+    SacTrainConfig,
+    Training,
+    optimize,
+    with_restarts,
+)
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.task import Task
 from astra_data.worlds.variation import PlanarVariation
@@ -189,3 +200,21 @@ def test_rows_and_their_plus_rows_differ_by_the_plus_settings_alone(
     assert priced.world == known.world.model_copy(update=changes)
     assert (plain.world, plus.world) == (known.world, priced.world) and plain.num_envs == PPO.num_envs
     assert not plain.draws_failures and not plus.draws_failures
+
+
+def test_each_try_has_its_part_of_the_progress_and_a_policy_says_what_it_learned_from(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    notes = list[tuple[float, str]]()
+    config = PPO.model_copy(update={"tries": 2})
+    given = training(tmp_path, config, progress=lambda share, note: notes.append((share, note)))
+
+    def learn(one: Training) -> tuple[PolicyFile, dict[str, Any]]:
+        one.progress(0.5, "half")
+        return one.learned(ActorCritic(ActorCriticShape(8, 2)), Simulation(WorldConfig())), {"points": []}
+
+    monkeypatch.setattr("astra_data.policies.train.reached_in_own_world", lambda *_: Reached(0.0, 1.0))
+    learned, _ = with_restarts(learn, given, None)
+    assert notes == [(0.25, "try 1 of 2  half"), (0.75, "try 2 of 2  half")]
+    assert (learned.dataset, learned.content_hash) == (given.episodes.reference, given.episodes.content_hash)
+    assert learned.dataset != learned.content_hash and learned.observed == "abstract"
