@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Sequence
+from importlib.resources import files
 from itertools import groupby
 from pathlib import Path
 from typing import Annotated, Any
@@ -25,17 +26,6 @@ from astra_data.reports.figures.style import coverage, png
 TAGS = ("LeRobot", "robotics", "abstract-sim2real", "astra-data")
 
 WIDE = 4  # columns with more values than this have their names listed below the table
-
-CITATION = """\
-```bibtex
-@article{deng2026abstract,
-  title   = {Abstract Sim2Real through Approximate Information States},
-  author  = {Deng and Li and Hanna},
-  journal = {IEEE Robotics and Automation Letters},
-  year    = {2026},
-  doi     = {10.1109/LRA.2026.3688068}
-}
-```"""
 
 
 class Notes(Config):
@@ -75,65 +65,39 @@ def render_card(dataset: Dataset, notes: Notes, *, source: str | None = None, fi
     from huggingface_hub import DatasetCardData  # noqa: PLC0415 - slow to import
 
     description = dataset.description
+    name, tag = description["name"], f"data-{description['version']}"
     data = DatasetCardData(
         license=notes.license,
-        pretty_name=description["name"],
+        pretty_name=name,
         task_categories=["robotics"],
         tags=list(TAGS),
         configs=[{"config_name": "default", "data_files": "data/*/*.parquet"}],
     )
-    picture = f"![Steps per cell of the plane]({figure})" if figure else ""
-    sections = {
-        "Loading": _loading(dataset, source),
-        "Behavior": notes.behavior,
-        "Intended use": notes.intended_use,
-        "Limits": notes.limits,
-        "Contents": _counts(dataset),
-        "Columns": _columns(dataset),
-        "Provenance": "<details>\n<summary>How it was made, and the sum of its values</summary>\n\n"
-        f"{_provenance(description)}\n\n</details>",
-        "Citation": f"The method that these datasets are made for:\n\n{CITATION}",
-    }
-    front = [f"---\n{data.to_yaml()}\n---", f"# {description['name']}", notes.summary, _opening(dataset)]
-    parts = [*front, picture, *(f"## {title}\n\n{text.strip()}" for title, text in sections.items() if text)]
-    return "\n\n".join(part.strip() for part in parts if part) + "\n"
-
-
-def _loading(dataset: Dataset, source: str | None) -> str:
-    name, tag = dataset.description["name"], f"data-{dataset.description['version']}"
     place = None if source is None else parse_source(source)[0]
+    root = "" if isinstance(place, HubStore) else f'root = "datasets/{name}/{tag}"\n'
+    lerobot, rows = f'"{name}", root=root', '"parquet", data_files=f"{root}/data/*/*.parquet", split="train"'
     if isinstance(place, HubStore):
-        lerobot = f'LeRobotDataset("{place.repo}", revision="{tag}")'
-        rows = f'load_dataset("{place.repo}", revision="{tag}", split="train")'
-        root = ""
-    else:
-        root = f'root = "datasets/{name}/{tag}"\n'
-        lerobot = f'LeRobotDataset("{name}", root=root)'
-        rows = 'load_dataset("parquet", data_files=f"{root}/data/*/*.parquet", split="train")'
-    column = STATE if STATE in dataset.features else dataset.schema[0].name
-    fetched = f"```sh\nastra-data pull {source} --version {tag[5:]}\n```\n\n" if source else ""
-    return f"""\
-{fetched}```python
-from astra_data.dataset.versions import open_dataset
-
-values = open_dataset("{dataset.reference}").columns([{json.dumps(column)}])
-```
-
-With [LeRobot](https://github.com/huggingface/lerobot):
-
-```python
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-{root}dataset = {lerobot}
-```
-
-With [datasets](https://github.com/huggingface/datasets):
-
-```python
-from datasets import load_dataset
-
-{root}rows = {rows}
-```"""
+        lerobot = f'"{place.repo}", revision="{tag}"'
+        rows = f'{lerobot}, split="train"'
+    by_hand = {"Behavior": notes.behavior, "Intended use": notes.intended_use, "Limits": notes.limits}
+    template = files("astra_data.io.hub").joinpath("card.md.template").read_text(encoding="utf-8")
+    return template.format(
+        front=data.to_yaml(),
+        name=name,
+        summary=f"{notes.summary.strip()}\n\n" if notes.summary else "",
+        opening=_opening(dataset),
+        picture=f"![Steps per cell of the plane]({figure})\n\n" if figure else "",
+        fetch=f"```sh\nastra-data pull {source} --version {tag[5:]}\n```\n\n" if source else "",
+        reference=dataset.reference,
+        column=json.dumps(STATE if STATE in dataset.features else dataset.schema[0].name),
+        root=root,
+        lerobot=f"LeRobotDataset({lerobot})",
+        rows=f"load_dataset({rows})",
+        notes="".join(f"## {title}\n\n{text.strip()}\n\n" for title, text in by_hand.items() if text),
+        counts=_counts(dataset),
+        columns=_columns(dataset),
+        provenance=_provenance(description),
+    )
 
 
 def _opening(dataset: Dataset) -> str:
