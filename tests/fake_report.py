@@ -7,12 +7,11 @@ import numpy as np
 from fake_runs import FakeRecipe
 
 from astra_data.pipeline.stages.report import ReportConfig, report
-from astra_data.reports.figures.motion import CommandReplay
 from astra_data.reports.results import Results, read_results
 from astra_data.worlds.objective import SUCCESS
 from astra_data.worlds.plane.mazes import U_MAZE
 
-REPLAY = CommandReplay(np.arange(4, dtype=np.float64), np.zeros((4, 2)), np.zeros((4, 4)), np.zeros((2, 4, 4)))
+REPLAY = (np.arange(4, dtype=np.float64), np.zeros((4, 2)), np.zeros((4, 4)), np.zeros((2, 4, 4)))
 FIGURES = {"success", "trajectories", "mismatch", "learning", "gap", "validity"}
 CONFIG = ReportConfig(trajectory_episodes=2)
 COMMAND = "astra-data run recipes/antmaze_u.toml"

@@ -5,93 +5,78 @@ from typing import Annotated, Any
 
 import typer
 
-from astra_data.cli.arguments import (
-    DatasetName,
-    Jobs,
-    NewName,
-    Out,
-    Root,
-    Seeds,
-    Source,
-    TaskOrRecipe,
-    refuse,
-    refuse_of_recipes,
-    resumable,
-    run_stage,
-    task_at,
-    with_settings,
-)
+from astra_data.cli import arguments
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import RUNS
 
 
-@with_settings("astra_data.pipeline.stages.collect:CollectConfig")
+@arguments.with_settings("astra_data.pipeline.stages.collect:CollectConfig")
 def collect(
-    task: TaskOrRecipe,
+    task: arguments.TaskOrRecipe,
     settings: dict[str, Any],
     seeds: Annotated[
         list[int] | None,
         typer.Option("--seed", help="Random seed; of a recipe, run only this one.", show_default="0; all of a recipe"),
     ] = None,
-    jobs: Jobs = None,
-    root: Root = RUNS,
+    jobs: arguments.Jobs = None,
+    root: arguments.Root = RUNS,
     name: Annotated[str | None, typer.Option(help="Its name.", show_default="task, behavior and seed")] = None,
-    out: Out = None,
+    out: arguments.Out = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue the same command after an interruption.")] = False,
 ) -> None:
     """Record episodes in the target environment."""
     if task.endswith(".toml"):
-        refuse({**settings, "name": name, "out": out, "resume": resume or None}, "collect")
-        run_stage(Path(task), "collect", seeds=seeds, jobs=jobs, root=root)
+        arguments.refuse({**settings, "name": name, "out": out, "resume": resume or None}, "collect")
+        arguments.run_stage(Path(task), "collect", seeds=seeds, jobs=jobs, root=root)
         return
-    seed = refuse_of_recipes("collect", seeds, jobs) or 0
-    task_at(task)
+    seed = arguments.refuse_of_recipes("collect", seeds, jobs) or 0
+    arguments.task_at(task)
     import torch
 
     # The networks' idle threads would slow down the physics.
     torch.set_num_threads(1)
-    with resumable("run the same command with --resume to continue"):
+    with arguments.resumable("run the same command with --resume to continue"):
         _make("collect", task, settings, seed=seed, out=out, name=name, resume=resume)
 
 
-@with_settings("astra_data.pipeline.stages.pair:PairConfig")
+@arguments.with_settings("astra_data.pipeline.stages.pair:PairConfig")
 def pair(
-    dataset: Source,
+    dataset: arguments.Source,
     settings: dict[str, Any],
-    seeds: Seeds = None,
-    jobs: Jobs = None,
-    root: Root = RUNS,
+    seeds: arguments.Seeds = None,
+    jobs: arguments.Jobs = None,
+    root: arguments.Root = RUNS,
     simulator: Annotated[
         str | None,
         typer.Option(help="A task, an installed simulator, or your own class: path.py:MySimulator. Its code is run."),
     ] = None,
-    name: NewName = None,
-    out: Out = None,
+    name: arguments.NewName = None,
+    out: arguments.Out = None,
 ) -> None:
     """Add the abstract simulator's next state, from the same state and action, to every step."""
     if dataset.endswith(".toml"):
-        refuse({**settings, "simulator": simulator, "name": name, "out": out}, "pair")
-        run_stage(Path(dataset), "pair", seeds=seeds, jobs=jobs, root=root)
+        arguments.refuse({**settings, "simulator": simulator, "name": name, "out": out}, "pair")
+        arguments.run_stage(Path(dataset), "pair", seeds=seeds, jobs=jobs, root=root)
         return
     if seeds or jobs is not None:
         raise BadInputError("pair: with a dataset, leave out --seed and --jobs (these are for recipes)")
     if simulator is None:
         raise BadInputError("pair: expected --simulator: a task or path.py:MySimulator")
-    task_at(simulator)
+    arguments.task_at(simulator)
     from astra_data.dataset.versions import locate
 
     _make("pair", simulator, settings, dataset=locate(dataset), name=name, out=out)
 
 
-@with_settings("astra_data.pipeline.stages.augment:AugmentConfig")
+@arguments.with_settings("astra_data.pipeline.stages.augment:AugmentConfig")
 def augment(
-    dataset: DatasetName,
+    dataset: arguments.DatasetName,
     settings: dict[str, Any],
     task: Annotated[
         str | None, typer.Option(help="Task that computes rewards and ends of copies.", show_default="the dataset's")
     ] = None,
-    name: NewName = None,
-    out: Out = None,
+    name: arguments.NewName = None,
+    out: arguments.Out = None,
     seed: Annotated[int, typer.Option(help="Random seed.")] = 0,
 ) -> None:
     """Add rotated and shifted copies of episodes; the dataset must not be paired yet."""
@@ -101,14 +86,14 @@ def augment(
 
 
 def label(
-    dataset: DatasetName,
+    dataset: arguments.DatasetName,
     task: Annotated[str, typer.Option(help="A task: a name, or a place such as cart.py:TASK. Its code is run.")],
     seed: Annotated[int, typer.Option(help="Random seed of the goals.")] = 0,
-    name: NewName = None,
-    out: Out = None,
+    name: arguments.NewName = None,
+    out: arguments.Out = None,
 ) -> None:
     """Compute the goals, rewards, successes and failures that a log lacks, as a task defines them."""
-    task_at(task)
+    arguments.task_at(task)
     from astra_data.dataset.versions import locate
 
     _make("label", task, None, data=locate(dataset), seed=seed, name=name, out=out)

@@ -7,26 +7,14 @@ from typing import Annotated, Any
 
 import typer
 
-from astra_data.cli.arguments import (
-    DatasetName,
-    Jobs,
-    NewName,
-    Out,
-    Root,
-    Source,
-    StoredSeeds,
-    refuse,
-    refuse_of_recipes,
-    run_stage,
-    show_table,
-)
+from astra_data.cli import arguments
 from astra_data.core.durable import write_file
 from astra_data.core.errors import AstraDataError, BadInputError, CorruptDatasetError
 from astra_data.core.naming import RUNS, first_few, printable
 
 
 def subset(
-    dataset: Source,
+    dataset: arguments.Source,
     episodes: Annotated[int | None, typer.Option(min=1, help="Number of episodes to keep.")] = None,
     percent: Annotated[
         int | None, typer.Option(min=1, help="The same as a percentage of --of; may exceed 100.")
@@ -34,22 +22,22 @@ def subset(
     of: Annotated[
         int | None, typer.Option(min=1, help="Episodes that count as 100 percent.", show_default="all")
     ] = None,
-    seeds: StoredSeeds = None,
+    seeds: arguments.StoredSeeds = None,
     stratify: Annotated[
         str | None, typer.Option(help="Key of the episodes' metadata whose values keep their proportions.")
     ] = None,
-    name: NewName = None,
-    out: Out = None,
-    jobs: Jobs = None,
-    root: Root = RUNS,
+    name: arguments.NewName = None,
+    out: arguments.Out = None,
+    jobs: arguments.Jobs = None,
+    root: arguments.Root = RUNS,
 ) -> None:
     """Write a random subset; with the same seed, smaller subsets are contained in larger ones."""
     size = {"episodes": episodes, "percent": percent, "of": of}
     if dataset.endswith(".toml"):
-        refuse(size | {"stratify": stratify, "name": name, "out": out}, "subset", "sweep")
-        run_stage(Path(dataset), "subset", seeds=seeds, jobs=jobs, root=root)
+        arguments.refuse(size | {"stratify": stratify, "name": name, "out": out}, "subset", "sweep")
+        arguments.run_stage(Path(dataset), "subset", seeds=seeds, jobs=jobs, root=root)
         return
-    seed = refuse_of_recipes("subset", seeds, jobs)
+    seed = arguments.refuse_of_recipes("subset", seeds, jobs)
     from astra_data.dataset.edit import subset as write
     from astra_data.dataset.versions import open_dataset
 
@@ -64,8 +52,8 @@ def merge(
     new_uids: Annotated[
         bool, typer.Option("--new-uids", help="Give new uids to episodes whose uid is already taken.")
     ] = False,
-    name: NewName = None,
-    out: Out = None,
+    name: arguments.NewName = None,
+    out: arguments.Out = None,
 ) -> None:
     """Merge the episodes of several datasets into one."""
     from astra_data.dataset.edit import merge as write
@@ -75,7 +63,7 @@ def merge(
 
 
 def filter_(
-    dataset: DatasetName,
+    dataset: arguments.DatasetName,
     without: Annotated[
         list[int] | None, typer.Option(metavar="UID", help="Leave out the episode with this uid; may be repeated.")
     ] = None,
@@ -86,8 +74,8 @@ def filter_(
     max_return: Annotated[float | None, typer.Option(help="Maximum return.")] = None,
     min_length: Annotated[int | None, typer.Option(help="Minimum steps.")] = None,
     max_length: Annotated[int | None, typer.Option(help="Maximum steps.")] = None,
-    name: NewName = None,
-    out: Out = None,
+    name: arguments.NewName = None,
+    out: arguments.Out = None,
 ) -> None:
     """Write a dataset of the episodes that meet every given condition, or without some of them."""
     from astra_data.dataset.edit import delete, filter_episodes
@@ -151,7 +139,7 @@ def _report(folder: Path) -> None:
 
 
 def inspect(
-    dataset: DatasetName,
+    dataset: arguments.DatasetName,
     plot: Annotated[
         Path | None, typer.Option(help="Folder for figures of positions and velocities.", show_default="no figures")
     ] = None,
@@ -228,7 +216,7 @@ def list_(
             steps = int(found.lengths.sum())
             facts = (printable(found.description["stage"]), f"{len(found):,}", f"{steps:,}", found.content_hash[:12])
             table.add_row(found.reference, *facts)
-    show_table(table)
+    arguments.show_table(table)
     if faults:
         raise CorruptDatasetError("\n".join(faults))
 
@@ -245,7 +233,7 @@ def _list_tasks() -> None:
         shown = name if name in TASKS else f"{name} (installed)"
         values = first_few(list(known.limits), _NAMED), first_few(states, _NAMED)
         table.add_row(shown, *values, "yes" if known.has_target else "no", str(known.fps))
-    show_table(table)
+    arguments.show_table(table)
     typer.echo(
         "`astra-data check TASK` tests one and shows all its values. Name your own task by its place: "
         "cart.py:TASK or package.module:TASK. Its code is run."
@@ -273,7 +261,7 @@ def _clean(folders: list[Path]) -> None:
 
 
 def validate(
-    dataset: DatasetName,
+    dataset: arguments.DatasetName,
     with_lerobot: Annotated[
         bool, typer.Option("--with-lerobot", help="Also compare with what lerobot's own loader reads (slow).")
     ] = False,
@@ -308,7 +296,7 @@ def validate(
 
 
 def repair(
-    dataset: DatasetName,
+    dataset: arguments.DatasetName,
     out: Annotated[Path, typer.Option(help="Folder of the new dataset.")],
     like: Annotated[
         list[str] | None,
@@ -336,7 +324,7 @@ _SHOWN = 5
 
 
 def log(
-    dataset: DatasetName,
+    dataset: arguments.DatasetName,
     other: Annotated[str | None, typer.Argument(metavar="[OTHER]", help="Show how this one differs from it.")] = None,
 ) -> None:
     """Show what a dataset was made from, as a tree; or how two differ: columns, episodes by uid, origin."""

@@ -6,21 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from astra_data.cli.arguments import (
-    Device,
-    Jobs,
-    Methods,
-    RecipePath,
-    Root,
-    RunFolder,
-    Seeds,
-    Until,
-    recipe_at,
-    resumable,
-    run_at,
-    run_stage,
-    task_at,
-)
+from astra_data.cli import arguments
 from astra_data.core.errors import AstraDataError, BadInputError
 from astra_data.core.naming import RUNS, artifact_key
 
@@ -31,16 +17,16 @@ Row = Annotated[str, typer.Option(metavar="ROW", help="A row of the run's recipe
 
 
 def run(
-    recipe: RecipePath,
-    methods: Methods = None,
-    seeds: Seeds = None,
+    recipe: arguments.RecipePath,
+    methods: arguments.Methods = None,
+    seeds: arguments.Seeds = None,
     percents: Annotated[
         list[int] | None, typer.Option("--percent", help="Run only this dataset size; may be repeated.")
     ] = None,
-    jobs: Jobs = None,
-    device: Device = "cpu",
-    until: Until = None,
-    root: Root = RUNS,
+    jobs: arguments.Jobs = None,
+    device: arguments.Device = "cpu",
+    until: arguments.Until = None,
+    root: arguments.Root = RUNS,
     engine: Annotated[
         str, typer.Option(help="processes of this machine, or ray: tasks of a Ray cluster.")
     ] = "processes",
@@ -53,12 +39,12 @@ def run(
     ] = None,
 ) -> None:
     """Run all stages of a recipe; after an interruption, run it again to continue."""
-    recipe_at(recipe)
+    arguments.recipe_at(recipe)
     from astra_data.pipeline.run import run as run_recipe
 
     which: dict[str, Any] = {"methods": methods or (), "seeds": seeds or (), "percents": percents or (), "until": until}
     how: dict[str, Any] = {"jobs": jobs, "device": device, "engine": engine, "address": address, "trackio": trackio}
-    with resumable():
+    with arguments.resumable():
         show_made(run_recipe(recipe, **which, root=root, **how), until)
 
 
@@ -66,7 +52,7 @@ def check(
     recipes: Annotated[
         list[str], typer.Argument(metavar="RECIPE|TASK...", help="Recipes (.toml); or tasks: names, or cart.py:TASK.")
     ],
-    root: Root = RUNS,
+    root: arguments.Root = RUNS,
     verify: Annotated[bool, typer.Option("--verify", help="Read every byte, instead of comparing sizes.")] = False,
 ) -> None:
     """Check recipes, listing which artifacts are finished, damaged or stale; or tasks. Nothing is run."""
@@ -75,9 +61,9 @@ def check(
     for name, of_task in zip(recipes, is_task, strict=True):
         try:
             if of_task:
-                _check_task(task_at(name))
+                _check_task(arguments.task_at(name))
             else:
-                faults += _check_recipe(recipe_at(Path(name)), root, verify)
+                faults += _check_recipe(arguments.recipe_at(Path(name)), root, verify)
         except AstraDataError as error:
             faults.append(str(error))
     if faults:
@@ -121,14 +107,14 @@ def _of_networks(stage: str, summary: str) -> Callable[..., None]:
     """Return the command of a stage that fits networks."""
 
     def command(
-        recipe: RecipePath,
-        methods: Methods = None,
-        seeds: Seeds = None,
-        jobs: Jobs = None,
-        device: Device = "cpu",
-        root: Root = RUNS,
+        recipe: arguments.RecipePath,
+        methods: arguments.Methods = None,
+        seeds: arguments.Seeds = None,
+        jobs: arguments.Jobs = None,
+        device: arguments.Device = "cpu",
+        root: arguments.Root = RUNS,
     ) -> None:
-        run_stage(recipe, stage, methods=methods, seeds=seeds, jobs=jobs, device=device, root=root)
+        arguments.run_stage(recipe, stage, methods=methods, seeds=seeds, jobs=jobs, device=device, root=root)
 
     command.__doc__ = summary
     return command
@@ -142,11 +128,11 @@ align = _of_networks("align", "Fit the target encoder so that its latents match 
 
 
 def evaluate(
-    recipe: RecipePath,
-    methods: Methods = None,
-    seeds: Seeds = None,
-    jobs: Jobs = None,
-    root: Root = RUNS,
+    recipe: arguments.RecipePath,
+    methods: arguments.Methods = None,
+    seeds: arguments.Seeds = None,
+    jobs: arguments.Jobs = None,
+    root: arguments.Root = RUNS,
     policy: Annotated[
         str | None,
         typer.Option(help="Test this policy of yours instead of the row's: path.py:POLICY. Its code is run."),
@@ -157,7 +143,7 @@ def evaluate(
     if policy is None:
         if out is not None:
             raise BadInputError("evaluate: --out goes with --policy; without it, leave out --out")
-        run_stage(recipe, "evaluate", methods=methods, seeds=seeds, jobs=jobs, root=root)
+        arguments.run_stage(recipe, "evaluate", methods=methods, seeds=seeds, jobs=jobs, root=root)
         return
     if not (methods and seeds and out) or len(methods) + len(seeds) > 2 or jobs is not None:
         raise BadInputError("evaluate: with --policy, give one --method, one --seed and --out, and leave out --jobs")
@@ -170,9 +156,11 @@ def evaluate(
     typer.echo(f"finished: {out}")
 
 
-def report(recipe: RecipePath, seeds: Seeds = None, publish: Publish = False, root: Root = RUNS) -> None:
+def report(
+    recipe: arguments.RecipePath, seeds: arguments.Seeds = None, publish: Publish = False, root: arguments.Root = RUNS
+) -> None:
     """Write the recipe's tables and figures."""
-    show_made(run_stage(recipe, "report", seeds=seeds, publish=publish, root=root).parent, None)
+    show_made(arguments.run_stage(recipe, "report", seeds=seeds, publish=publish, root=root).parent, None)
 
 
 def show_made(folder: Path, until: str | None) -> None:
@@ -206,7 +194,7 @@ def show_made(folder: Path, until: str | None) -> None:
 
 
 def select(
-    run: RunFolder,
+    run: arguments.RunFolder,
     row: Annotated[
         list[str] | None,
         typer.Option(metavar="ROW", help="Rank only policies of this row; may be repeated.", show_default="all"),
@@ -227,7 +215,7 @@ def select(
     percent: Annotated[int | None, typer.Option(help="With --trials, after a sweep: of this dataset size.")] = None,
 ) -> None:
     """Rank the trained policies of a run without the target, or with a few trials in it."""
-    run_at(run)
+    arguments.run_at(run)
     if trials is None and (field is not None or percent is not None):
         raise BadInputError("--field and --percent need --trials: add --trials, or leave them out")
     from astra_data.pipeline.display import shown
@@ -252,7 +240,7 @@ def select(
 
 
 def deploy(
-    run: RunFolder,
+    run: arguments.RunFolder,
     row: Row,
     out: Annotated[Path | None, typer.Option(help="The new folder.", show_default="RUN/deploy/ROW/seed_SEED")] = None,
     seed: Annotated[int, typer.Option(help="A seed of the run's recipe.")] = 0,
@@ -261,7 +249,7 @@ def deploy(
     """Export a trained policy as a folder that runs without this package."""
     from astra_data.core.durable import refuse_existing
 
-    run_at(run)
+    arguments.run_at(run)
     out = out or run / artifact_key("deploy", row, seed, percent)
     refuse_existing(out)
     from astra_data.deployment.folder import deploy as write
@@ -270,13 +258,13 @@ def deploy(
 
 
 def view(
-    run: RunFolder,
+    run: arguments.RunFolder,
     save: Annotated[Path | None, typer.Option(metavar="FILE.rrd", help="Write a recording.")] = None,
     uids: Annotated[list[int] | None, typer.Option("--episode", help="Its uid; may be repeated.")] = None,
     seed: Annotated[int | None, typer.Option(help="One of its recipe's.", show_default="the first")] = None,
 ) -> None:
     """Show a run's held-out episodes in Rerun, and replays of them in its simulators."""
-    run_at(run)
+    arguments.run_at(run)
     from astra_data.pipeline.run_view import view_run
 
     view_run(run, uids or (), seed=seed, save=save)

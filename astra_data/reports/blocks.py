@@ -8,7 +8,6 @@ from html import escape
 from importlib.resources import files
 
 _PIXEL = 2  # pixels of a figure for each of the page
-_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 
 
 @dataclass(frozen=True)
@@ -122,28 +121,21 @@ def _markdown(block: Block, figures: Mapping[str, str]) -> str:
 
 def html(title: str, sections: Sequence[Section], images: Mapping[str, bytes] | None = None) -> str:
     """Return the page in HTML, with the PNG `images` of its figures, by name, inside it."""
-    written = [
-        (section, body)
-        for section in sections
-        if (body := "\n".join(filter(None, (_html(block, images or {}) for block in section.blocks))))
-    ]
+    bodies = ("\n".join(filter(None, (_html(block, images or {}) for block in section.blocks))) for section in sections)
+    written = [(section, body) for section, body in zip(sections, bodies, strict=True) if body]
     links = "".join(
         f'<li><a href="#{_anchor(section)}">{escape(section.title)}</a></li>' for section, _ in written if section.title
     )
-    css = files("astra_data.reports").joinpath("results.css").read_text()
-    return "\n".join(
-        [
-            '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
-            '<meta name="viewport" content="width=device-width, initial-scale=1">',
-            '<meta name="color-scheme" content="light dark">',
-            f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">',
-            f"<title>{escape(title)}: results</title>",
-            f'<link rel="icon" href="data:,">\n<style>\n{css}</style>\n</head>\n<body>',
-            f'<nav aria-label="Sections"><ul>{links}</ul></nav>',
-            f'<main class="sheet">\n<h1>{escape(title)}</h1>',
-            *(_html_section(section, body) for section, body in written),
-            "</main>\n</body>\n</html>\n",
-        ]
+    folder = files("astra_data.reports")
+    return (
+        (folder / "results.html.template")
+        .read_text(encoding="utf-8")
+        .format(
+            title=escape(title),
+            css=(folder / "results.css").read_text(encoding="utf-8"),
+            links=links,
+            body="\n".join(_html_section(section, body) for section, body in written),
+        )
     )
 
 

@@ -270,6 +270,14 @@ def select_page(recipe: str, judged: Judgment, trials: TrialsFile | None = None)
 
 
 def _trial_blocks(judged: Judgment, trials: TrialsFile) -> list[Text | TableBlock]:
+    priors = {(one.row, one.seed): one.lower for one in judged.ranked(trials.percent)}
+    every, lines = {key: list[int]() for key in priors}, list[list[str]]()
+    for number, one in ((number, one) for number, of in enumerate(trials.rounds, start=1) for one in of.tried):
+        found = every[one.row, one.seed]
+        found += one.success
+        mean = posterior(priors[one.row, one.seed], sum(found), len(found))
+        cells = (f"{number}", method_title(one.row), f"{one.seed}", f"{sum(one.success)}")
+        lines.append([*cells, f"{len(one.success)}", f"{mean:.2f}"])
     state = "Not finished: run the same command again."
     if trials.chosen and trials.mean is not None:
         row, seed = trials.chosen
@@ -281,25 +289,10 @@ def _trial_blocks(judged: Judgment, trials: TrialsFile) -> list[Text | TableBloc
             f"{state} {trials.spent} of {trials.trials} episodes were used, on the {trials.field} candidates "
             f"that the prediction ranks highest{size}."
         ),
-        TableBlock("", ["round", "method", "seed", "succeeded", "of", "mean"], trial_lines(judged, trials), words=2),
+        TableBlock("", ["round", "method", "seed", "succeeded", "of", "mean"], lines, words=2),
         Text(
             "Trials are split equally over rounds, and within a round over its candidates, which get the same starts "
             "and goals. After each round, the better half goes on. Mean: mean success over all trials of a candidate "
             f"so far, with the judges' lower quartile as a prior worth {trials.pseudo_trials} trials."
         ),
     ]
-
-
-def trial_lines(judged: Judgment, trials: TrialsFile) -> list[list[str]]:
-    """Return a line for each candidate of each round, as far as it was tried."""
-    priors = {(one.row, one.seed): one.lower for one in judged.ranked(trials.percent)}
-    counts = dict.fromkeys(priors, (0, 0))
-    lines = []
-    for number, of in enumerate(trials.rounds, start=1):
-        for one in of.tried:
-            key = (one.row, one.seed)
-            counts[key] = (counts[key][0] + sum(one.success), counts[key][1] + len(one.success))
-            mean = posterior(priors[key], *counts[key])
-            cells = (f"{number}", method_title(one.row), f"{one.seed}", f"{sum(one.success)}")
-            lines.append([*cells, f"{len(one.success)}", f"{mean:.2f}"])
-    return lines

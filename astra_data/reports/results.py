@@ -1,7 +1,7 @@
 """Results of a recipe: what results.json holds, as tidy tables of which all pages and figures are made."""
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -403,8 +403,3 @@ def results_json(results: Results) -> str:
         each = ",\n".join(f"    {json.dumps(line, ensure_ascii=False)}" for line in lines)
         text += f',\n  "{name}": [\n{each}\n  ]'
     return f"{text}\n}}\n"
-
-
-def without_nan(values: Mapping[str, float | None]) -> dict[str, float]:
-    """Return the values that are numbers."""
-    return {name: float(value) for name, value in values.items() if value is not None and not np.isnan(value)}

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from math import isnan
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,35 +14,8 @@ from astra_data.core.naming import CODE, artifact_key, base_method
 from astra_data.core.provenance import origin
 from astra_data.dataset.format import DATASET_PATH
 from astra_data.methods import grounded_as, method_named
-from astra_data.reports.artifacts import (
-    CURVE,
-    EVALUATION,
-    GAP,
-    METRICS,
-    TRAJECTORIES,
-    Artifact,
-    CurveFile,
-    DatasetFile,
-    Evaluation,
-    Gap,
-    Metrics,
-    read_json,
-    way_to_success,
-)
+from astra_data.reports import artifacts, results
 from astra_data.reports.choice import Judgment, read_judged
-from astra_data.reports.results import (
-    SIMULATED,
-    TESTED,
-    WHOLE,
-    DatasetUse,
-    Errors,
-    Line,
-    Origin,
-    Results,
-    TrainingFacts,
-    merged_origins,
-    without_nan,
-)
 from astra_data.worlds.objective import SUCCESS, Score
 
 DATASET_STAGES = ("collect", "label", "augment", "pair", "subset")
@@ -78,7 +52,7 @@ class Owner(NamedTuple):
 
     def facts(self) -> dict[str, Any]:
         """Return it as fields of `OfSeed`."""
-        return self._asdict() | {"percent": WHOLE if self.percent is None else self.percent}
+        return self._asdict() | {"percent": results.WHOLE if self.percent is None else self.percent}
 
 
 class RunReader:
@@ -86,42 +60,43 @@ class RunReader:
 
     def __init__(self, root: Path) -> None:
         self._root = root
-        self.origins: list[Origin] = []
-        self.lines: list[Line] = []
-        self.errors: list[Errors] = []
+        self.origins: list[results.Origin] = []
+        self.lines: list[results.Line] = []
+        self.errors: list[results.Errors] = []
 
     def path(self, stage: str, owner: Owner, name: str) -> Path:
         """Return the place of an artifact's file."""
         return self._root / artifact_key(stage, *owner) / name
 
-    def read[A: Artifact](self, stage: str, owner: Owner, name: str, model: type[A]) -> A | None:
+    def read[A: artifacts.Artifact](self, stage: str, owner: Owner, name: str, model: type[A]) -> A | None:
         """Read an artifact's file, and write down its origin and numbers; None where there is none."""
         path = self.path(stage, owner, name)
-        return self.add(stage, owner, read_json(model, path)) if path.is_file() else None
+        return self.add(stage, owner, artifacts.read_json(model, path)) if path.is_file() else None
 
-    def add[A: Artifact](self, stage: str, owner: Owner, file: A) -> A:
+    def add[A: artifacts.Artifact](self, stage: str, owner: Owner, file: A) -> A:
         """Write down the origin and the numbers of a file."""
         self.origins.append(
-            Origin(commit=file.git_commit, machine=file.machine, packages=file.packages, stages=[stage])
+            results.Origin(commit=file.git_commit, machine=file.machine, packages=file.packages, stages=[stage])
         )
         self._line(owner, stage, file.numbers())
         return file
 
     def _line(self, owner: Owner, where: str, values: Mapping[str, float | None]) -> None:
-        if known := without_nan(values):
-            self.lines.append(Line(**owner.facts(), where=where, values=known))
+        if known := {name: float(one) for name, one in values.items() if one is not None and not isnan(one)}:
+            self.lines.append(results.Line(**owner.facts(), where=where, values=known))
 
-    def evaluation(self, owner: Owner) -> Evaluation:
+    def evaluation(self, owner: Owner) -> artifacts.Evaluation:
         """Read how a method was tested."""
-        file = self.add("evaluate", owner, read_json(Evaluation, self.path("evaluate", owner, EVALUATION)))
+        path = self.path("evaluate", owner, artifacts.EVALUATION)
+        file = self.add("evaluate", owner, artifacts.read_json(artifacts.Evaluation, path))
         values: dict[str, float | None] = {**file.outcomes.means(), "beyond_recorded": file.beyond_recorded}
-        trajectories = self.path("evaluate", owner, TRAJECTORIES)
+        trajectories = self.path("evaluate", owner, artifacts.TRAJECTORIES)
         if trajectories.is_file():
-            values["distance"] = way_to_success(trajectories, file)
-        self._line(owner, TESTED, values)
+            values["distance"] = artifacts.way_to_success(trajectories, file)
+        self._line(owner, results.TESTED, values)
         # A hand-written row has no simulator of its own.
         simulated = file.grounded if file.simulated is None and file.encoder is None else file.simulated
-        for where, outcomes in {SIMULATED: simulated, "raw": file.raw, "grounded": file.grounded}.items():
+        for where, outcomes in {results.SIMULATED: simulated, "raw": file.raw, "grounded": file.grounded}.items():
             if outcomes is not None:
                 self._line(owner, where, outcomes.means())
         for encoder, means in file.encoders.items():
@@ -130,62 +105,62 @@ class RunReader:
 
     def grounding(self, owner: Owner) -> None:
         """Read times, R², predicted failures and open-loop errors on held-out episodes of a grounding."""
-        self.read("ground", owner, METRICS, Metrics)
-        if not self.path("ground", owner, GAP).is_file():
+        self.read("ground", owner, artifacts.METRICS, artifacts.Metrics)
+        if not self.path("ground", owner, artifacts.GAP).is_file():
             return
-        gap = read_json(Gap, self.path("ground", owner, GAP))
+        gap = artifacts.read_json(artifacts.Gap, self.path("ground", owner, artifacts.GAP))
         for simulator, of in {"still": gap.still or {}, "raw": gap.raw, "grounded": gap.grounded}.items():
             for quantity, band in of.items():
                 given: dict[str, Any] = {"simulator": simulator, "quantity": quantity, "horizons": gap.horizons}
-                self.errors.append(Errors(**owner.facts(), **given, **band.model_dump()))
+                self.errors.append(results.Errors(**owner.facts(), **given, **band.model_dump()))
 
 
 def read_run(
     reported: Reported, *, root: Path, command: str, scores: tuple[Score, ...] = (SUCCESS,), **facts: object
-) -> Results:
+) -> results.Results:
     """Return the results under `root` of every method, for the seeds that it has finished; `facts` are of `Results`."""
     rows, seeds, run = reported.methods, reported.seeds, RunReader(root)
-    files: list[Evaluation] = []
-    trainings: list[TrainingFacts] = []
+    files: list[artifacts.Evaluation] = []
+    trainings: list[results.TrainingFacts] = []
     if not rows or not seeds:
         raise BadInputError(f"{reported.name}: expected methods and seeds, got none; name some in the recipe")
     for percent in reported.percents or (None,):
         owners = [Owner(row, seed, percent) for row in rows for seed in seeds]
-        finished = [owner for owner in owners if run.path("evaluate", owner, EVALUATION).is_file()]
+        finished = [owner for owner in owners if run.path("evaluate", owner, artifacts.EVALUATION).is_file()]
         files += map(run.evaluation, finished)
         # Fine-tuned policies start from those of a method that need not be reported.
         initial = [(method_named(owner.row).initial, owner) for owner in finished]
         for owner in dict.fromkeys([*finished, *(owner._replace(row=row) for row, owner in initial if row)]):
-            curve = run.read("train", owner, CURVE, CurveFile)
+            curve = run.read("train", owner, artifacts.CURVE, artifacts.CurveFile)
             if curve and owner in finished:
                 steps = [point.steps for point in curve.points]
                 found = [point.success if scores[0] == SUCCESS else point.episode_steps for point in curve.points]
-                trainings.append(TrainingFacts.model_validate(owner.facts() | {"steps": steps, "score": found}))
+                trainings.append(results.TrainingFacts.model_validate(owner.facts() | {"steps": steps, "score": found}))
         for owner in dict.fromkeys(owner._replace(row=grounded_as(owner.row)) for owner in finished):
             run.grounding(owner)
-            run.read("align", owner, METRICS, Metrics)
+            run.read("align", owner, artifacts.METRICS, artifacts.Metrics)
     uses = []
     for stage in DATASET_STAGES:
         percents = reported.percents if stage == "subset" else (None,)
         for owner in (Owner("", seed, percent) for seed in seeds for percent in percents):
-            data = run.read(stage, owner, str(DATASET_PATH), DatasetFile)
+            data = run.read(stage, owner, str(DATASET_PATH), artifacts.DatasetFile)
             if data and owner.percent is None:
                 identity = data.model_dump(include={"name", "version", "content_hash"})
-                uses.append(DatasetUse(stage=stage, seed=owner.seed, **identity))
+                uses.append(results.DatasetUse(stage=stage, seed=owner.seed, **identity))
     for file in files:
         if file.dataset_hash:
             version, content = file.dataset_version or "", file.dataset_hash
-            uses.append(DatasetUse(stage="evaluate", seed=file.seed, version=version, content_hash=content))
+            uses.append(results.DatasetUse(stage="evaluate", seed=file.seed, version=version, content_hash=content))
     judgment = None
     if judged := read_judged(root):
         run.add("select", Owner("", seeds[0], None), judged)
         if known := [one for one in judged.candidates if one.row in rows and one.seed in seeds]:
             facts_of = judged.model_dump(include={"judge", "episodes", "shares_episodes"})
             judgment = Judgment(**facts_of, candidates=known)
-    run.add("report", Owner("", 0, None), Artifact.model_validate(origin()))
+    run.add("report", Owner("", 0, None), artifacts.Artifact.model_validate(origin()))
     if not files:
         raise MissingStageError(
-            f"expected {EVALUATION} in {root / 'evaluate'}/<method>/seed_<seed>/, found none for "
+            f"expected {artifacts.EVALUATION} in {root / 'evaluate'}/<method>/seed_<seed>/, found none for "
             f"{', '.join(rows)}; run the recipe {reported.name} again: it continues with what is missing"
         )
     first = files[0]
@@ -211,7 +186,7 @@ def read_run(
         "tested_in": "target" if all(file.target for file in files) else "simulators",
         "leg_scale": first.leg_scale,
         "settings": dict(reported.settings),
-        "origins": merged_origins(run.origins),
+        "origins": results.merged_origins(run.origins),
         "user_code": {name: recorded[name] for name in dict.fromkeys(code) if name in recorded},
         "judged": judgment,
         "datasets": [*dict.fromkeys(uses)],
@@ -219,4 +194,4 @@ def read_run(
         "errors": run.errors,
         "trainings": trainings,
     }
-    return Results.model_validate(made | facts)
+    return results.Results.model_validate(made | facts)

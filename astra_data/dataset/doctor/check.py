@@ -16,24 +16,16 @@ from astra_data.core.arrays import Floats
 from astra_data.core.durable import file_digest
 from astra_data.core.errors import AstraDataError, BadInputError, CorruptDatasetError, optional, unmet
 from astra_data.dataset import columns as names
+from astra_data.dataset import description as described
 from astra_data.dataset import format as layout
 from astra_data.dataset import plain
 from astra_data.dataset.cameras import clip_fault, read_cameras
 from astra_data.dataset.columns import Array
-from astra_data.dataset.description import (
-    SEALED,
-    Digests,
-    alteration,
-    altered_columns,
-    altered_files,
-    read_description,
-    read_digests,
-)
 from astra_data.dataset.parquet import read_blocks
 from astra_data.dataset.reader import Dataset, format_fault, refuse_run, refuse_versions
 from astra_data.dataset.statistics import episode_statistics, side_by_side
 
-_META_FILES = (*SEALED, layout.DATASET_PATH, layout.POLICY_PATH)
+_META_FILES = (*described.SEALED, layout.DATASET_PATH, layout.POLICY_PATH)
 MOST = 5  # findings of one kind that are shown; further ones are only counted
 ESTIMATED = 1e-3  # relative tolerance of LeRobot's statistics, which are summed in float32
 _SUMS = 3e-5  # error of its means of values and of squares, relative to the largest one; std is their difference
@@ -184,14 +176,14 @@ def _files_are_readable(root: Path, info: Mapping[str, Any], columns: list[plain
     return report.fault_count == before
 
 
-def _sealed_faults(root: Path, columns: list[plain.PlainColumn], report: Report) -> Digests:
+def _sealed_faults(root: Path, columns: list[plain.PlainColumn], report: Report) -> described.Digests:
     """Compare the files of our metadata with what was written; return the digests, empty if unknown."""
     try:
-        description = read_description(root)
+        description = described.read_description(root)
     except CorruptDatasetError as error:
         report.fault("origin", str(error))
         description = {}
-    altered = altered_files(root, description)
+    altered = described.altered_files(root, description)
     for path in altered:
         report.fault("sums", f"{path} was altered after it was written, or is missing")
     behavior = description.get("behavior")
@@ -201,7 +193,7 @@ def _sealed_faults(root: Path, columns: list[plain.PlainColumn], report: Report)
         if found != expected:
             report.fault("origin", f"{layout.POLICY_PATH} is {found}, expected the sha256 {expected}")
     try:
-        return read_digests(root, [column.name for column in columns], altered)
+        return described.read_digests(root, [column.name for column in columns], altered)
     except CorruptDatasetError as error:
         report.note("digests", f"{error}: it is not known which values were altered, if any")
         return {}
@@ -222,7 +214,7 @@ class EpisodeChecks:
     root: Path
     info: Mapping[str, Any]
     columns: Sequence[plain.PlainColumn]
-    digests: Digests
+    digests: described.Digests
     report: Report
     tasks: Mapping[int, str] = field(default_factory=dict)
     total: dict[str, Floats] = field(default_factory=dict)  # the statistics of all rows so far
@@ -268,8 +260,8 @@ class EpisodeChecks:
         unknown = [t for t in np.unique(run.columns[names.TASK_INDEX]).tolist() if t not in self.tasks]
         if unknown:
             report.fault("tasks", f"episode {number} has the unknown tasks {unknown}")
-        if altered := altered_columns(run.columns, number, self.digests):
-            report.fault("values", alteration(altered, run.path, run.row, len(run), number))
+        if altered := described.altered_columns(run.columns, number, self.digests):
+            report.fault("values", described.alteration(altered, run.path, run.row, len(run), number))
 
     def _check_row(self, number: int, run: plain.Run, row: Mapping[str, Any]) -> None:
         """Compare an episode with its row of meta/episodes."""

@@ -14,19 +14,7 @@ from astra_data.dataset.description import NAME
 from astra_data.dataset.doctor.check import check
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import Version, home_of, open_dataset
-from astra_data.io.hub.stores import (
-    SUMS_PATH,
-    HubStore,
-    RemoteFolder,
-    UrlStore,
-    altered,
-    explained,
-    is_address,
-    make_sums,
-    parse_place,
-    parse_source,
-    parse_sums,
-)
+from astra_data.io.hub import stores
 
 MOST_BYTES = 100 * 10**9  # most bytes that are downloaded unless more are asked for; a robot's logs stay far below
 MOST_NAMED = 20  # folders in which datasets are looked for, each with a request of its own
@@ -60,20 +48,20 @@ def push(
     """
     from astra_data.io.hub.card import Notes, write_card  # noqa: PLC0415 - draws, unlike pull
 
-    place = parse_place(destination)
+    place = stores.parse_place(destination)
     local = open_dataset(dataset)
     if local.recorded is not None:
         command = f"`astra-data subset {local.root} --percent 100`"
         raise BadInputError(f"{local.root} was recorded by LeRobot: make a dataset of it first, with {command}")
     written = load_recipe(notes, Notes) if notes else Notes()
-    if isinstance(place, UrlStore):
+    if isinstance(place, stores.UrlStore):
         if private:
             raise BadInputError(f"{place}: private is for the Hugging Face Hub; elsewhere, set permissions there.")
         place = place.below(local.description["name"])
     if faults := check(local.root).faults:
         raise CorruptDatasetError(f"{local.root} was altered: {'; '.join(faults)}. Restore it from a copy.")
     version = Version.parse(local.description["version"])
-    if isinstance(place, HubStore):
+    if isinstance(place, stores.HubStore):
         place.create(private=private)
     if version in place.versions():
         _refuse_change(place.folder(version), local)
@@ -81,22 +69,22 @@ def push(
         with TemporaryDirectory() as folder:
             card = Path(folder)
             write_card(local, card / "README.md", written, source=str(place))
-            (card / SUMS_PATH).write_text(make_sums(local.root), encoding="utf-8")
+            (card / stores.SUMS_PATH).write_text(stores.make_sums(local.root), encoding="utf-8")
             place.upload(local, card, progress)
     return f"{place}@{version.tag}"
 
 
-def _refuse_change(there: RemoteFolder, local: Dataset) -> None:
-    ours = parse_sums(make_sums(local.root), str(local.root))
-    listed = parse_sums(there.read_text(SUMS_PATH), there.name)
+def _refuse_change(there: stores.RemoteFolder, local: Dataset) -> None:
+    ours = stores.parse_sums(stores.make_sums(local.root), str(local.root))
+    listed = stores.parse_sums(there.read_text(stores.SUMS_PATH), there.name)
     if others := sorted(path for path in ours.keys() | listed if ours.get(path) != listed.get(path)):
         raise BadInputError(
-            f"{there.name} holds other values or was altered: {SUMS_PATH} there differs in "
+            f"{there.name} holds other values or was altered: {stores.SUMS_PATH} there differs in "
             f"{', '.join(others)}. Versions never change: give the dataset a new one, or push elsewhere."
         )
     if changed := [path for path, digest in ours.items() if there.differs(path, local.root / path, digest)]:
         raise SharingError(
-            f"{there.name} was altered: {', '.join(changed)} there differ from {SUMS_PATH}. "
+            f"{there.name} was altered: {', '.join(changed)} there differ from {stores.SUMS_PATH}. "
             "Delete this version there and push again, or push elsewhere."
         )
 
@@ -128,15 +116,15 @@ def pull(
         >>> pull(push("walks", "./shared"), out=Path("copy")).reference
         'walks@data-1.0.0'
     """
-    place, named = parse_source(source)
+    place, named = stores.parse_source(source)
     asked = Version.parse(version.removeprefix("data-")) if version else named
     if named and asked != named:
         raise BadInputError(f"{source} names {named.tag}, but the version asked for is {version}.")
-    if isinstance(place, HubStore) and not source.startswith("hf://") and Path(place.repo).is_dir():
+    if isinstance(place, stores.HubStore) and not source.startswith("hf://") and Path(place.repo).is_dir():
         raise BadInputError(f"{source} is a folder here: pull ./{source}, or hf://datasets/{source} of the Hub")
     known = place.versions()
     if not known:
-        if isinstance(place, UrlStore):
+        if isinstance(place, stores.UrlStore):
             inside = [f"{place}/{name}" for name in place.names()[:MOST_NAMED] if place.below(name).versions()]
             if inside:
                 raise BadInputError(f"{place} is a folder of datasets: pull one of {', '.join(inside)}")
@@ -154,7 +142,7 @@ def pull(
     if not isinstance(name, str) or not NAME.fullmatch(name) or called != str(chosen):
         raise SharingError(f"{remote.name} calls itself {name!r} {called!r}; it cannot be trusted.")
     target = home_of(description) if out is None else out
-    sums = parse_sums(remote.read_text(SUMS_PATH), remote.name)
+    sums = stores.parse_sums(remote.read_text(stores.SUMS_PATH), remote.name)
     if target.exists():
         dataset = _present(target, description, sums)
         progress(1.0, f"it is there already, and whole: {len(sums)} files were compared")
@@ -169,11 +157,11 @@ def pull(
 
 def opened(data: str | Path) -> Dataset:
     """Open a dataset here, or pull it."""
-    return pull(str(data)) if is_address(data) else open_dataset(data)
+    return pull(str(data)) if stores.is_address(data) else open_dataset(data)
 
 
 def _fetch_all(
-    remote: RemoteFolder,
+    remote: stores.RemoteFolder,
     sums: Mapping[str, str],
     target: Path,
     description: Mapping[str, Any],
@@ -194,7 +182,7 @@ def _fetch_all(
         for file in [file for file in partial.rglob("*") if file.is_file()]:
             if file.relative_to(partial).as_posix() not in sums:
                 file.unlink()
-        for number, path in enumerate(altered(partial, sums)):
+        for number, path in enumerate(stores.altered(partial, sums)):
             progress(number / len(sums), path)
             max_bytes -= fetch(remote, path, partial, max_bytes + 1)
             if max_bytes < 0:  # where the place does not know sizes
@@ -205,10 +193,10 @@ def _fetch_all(
     progress(1.0, f"{len(sums)} files")
 
 
-def fetch(remote: RemoteFolder, path: str, folder: Path, most: int) -> int:
+def fetch(remote: stores.RemoteFolder, path: str, folder: Path, most: int) -> int:
     """Download up to `most` bytes of the file `path` into `folder`; return how many."""
     target = folder / path
-    with explained(f"{remote.name}: {path}"), writing(target, place=False):
+    with stores.explained(f"{remote.name}: {path}"), writing(target, place=False):
         target.parent.mkdir(parents=True, exist_ok=True)
         with target.open("wb") as file:
             return sum(map(file.write, remote.blocks(path, most)))
@@ -225,7 +213,7 @@ def refuse_planted(folder: Path) -> None:
 
 def _present(target: Path, description: Mapping[str, Any], sums: Mapping[str, str]) -> Dataset:
     """Return the dataset in folder `target`, which must be the one described, whole."""
-    changed = altered(target, sums)
+    changed = stores.altered(target, sums)
     try:
         dataset = Dataset.open(target)
         is_other = dataset.content_hash != description.get("content_hash")
@@ -243,11 +231,11 @@ def _present(target: Path, description: Mapping[str, Any], sums: Mapping[str, st
 
 def _check(folder: Path, sums: Mapping[str, str], description: Mapping[str, Any], name: str) -> None:
     """Check that the files, which anybody may have written, are the complete dataset."""
-    if wrong := altered(folder, sums):
+    if wrong := stores.altered(folder, sums):
         for path in wrong:
             (folder / path).unlink(missing_ok=True)
         raise SharingError(
-            f"{name}: {', '.join(wrong)} do not have the sha256 in {SUMS_PATH}: the download was "
+            f"{name}: {', '.join(wrong)} do not have the sha256 in {stores.SUMS_PATH}: the download was "
             "cut off, or they were altered there; run the same command again."
         )
     try:

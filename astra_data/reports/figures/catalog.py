@@ -2,12 +2,13 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 from matplotlib.figure import Figure
 
 from astra_data.reports.blocks import Picture
-from astra_data.reports.figures.errors import open_loop_error, predictive_validity, reliability_of
+from astra_data.reports.figures.errors import open_loop_error, predictive_validity, reliability
 from astra_data.reports.figures.motion import mismatch, strips, trajectories
 from astra_data.reports.figures.scores import data_efficiency, learning_curves, score_bars
 from astra_data.reports.figures.style import Scene, png
@@ -32,9 +33,9 @@ _DIAMONDS = (
 )
 
 FIGURES = {
-    "success": Drawing(score_bars("success"), "Success {where}", _BARS + _DIAMONDS, "methods"),
-    "steps": Drawing(score_bars("steps"), "Survived steps {where}", _BARS + _DIAMONDS, "methods"),
-    "return": Drawing(score_bars("return"), "Return {where}", _BARS, "methods"),
+    "success": Drawing(partial(score_bars, measure="success"), "Success {where}", _BARS + _DIAMONDS, "methods"),
+    "steps": Drawing(partial(score_bars, measure="steps"), "Survived steps {where}", _BARS + _DIAMONDS, "methods"),
+    "return": Drawing(partial(score_bars, measure="return"), "Return {where}", _BARS, "methods"),
     "trajectories": Drawing(
         trajectories,
         "Trajectories",
@@ -68,7 +69,7 @@ FIGURES = {
         "gap",
     ),
     "reliability": Drawing(
-        reliability_of,
+        lambda results, _: reliability(rates) if (rates := results.failure_rates()) else None,
         "Reliability of predicted failures",
         "On the dashed line, as many failures happen as are predicted; above it, more. Bottom: the number "
         "of steps with each prediction.",
@@ -110,13 +111,9 @@ def drawn(results: Results, scene: Scene) -> dict[str, bytes]:
 
 def pictures(results: Results, section: str) -> list[Picture]:
     """Return the figures of a section as blocks of a page."""
+    where = results.where
     return [
-        Picture(
-            name,
-            figure.title.replace("{where}", results.where),
-            figure.caption.replace("{where}", results.where),
-            figure.photo,
-        )
-        for name, figure in FIGURES.items()
-        if figure.section == section
+        Picture(name, one.title.replace("{where}", where), one.caption.replace("{where}", where), one.photo)
+        for name, one in FIGURES.items()
+        if one.section == section
     ]

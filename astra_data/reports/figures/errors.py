@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullLocator
@@ -20,6 +19,7 @@ _UNITS = {"_m_s2": "m/s²", "_rad_s": "rad/s", "_m_s": "m/s", "_rad": "rad", "_d
 """Endings of the names of quantities."""
 
 
+@style()
 def open_loop_error(results: Results, _: Scene) -> Figure | None:
     """Draw the error over the horizon, one panel per quantity (named with its unit), on logarithmic axes."""
     if not results.errors:
@@ -28,109 +28,94 @@ def open_loop_error(results: Results, _: Scene) -> Figure | None:
     rows = [row for row in results.groundings() if (row, "grounded") in means.index]
     quantities = list(dict.fromkeys(means.index.get_level_values("quantity")))
     horizons = means.index.get_level_values("horizon").unique()
-    with style():
-        figure = Figure(figsize=(1.7 + 2.9 * len(quantities), 3.3), layout="constrained")
-        grid = figure.subplots(1, len(quantities), squeeze=False)[0]
-        for axes, quantity in zip(grid, quantities, strict=True):
-            bands = {row: means.loc[(row, "grounded", quantity)] for row in rows}
-            drawn: list[Floats] = []
-            for row in rows:
-                raw = means.loc[(row, "raw", quantity)]
-                values = raw.to_numpy().T
-                if not any(np.allclose(values, seen, rtol=SAME, equal_nan=True) for seen in drawn):
-                    label = None if drawn else "no grounding"
-                    draw_band(axes, raw.index, *values, color=INK, ls=":", label=label, marker="o", ms=3.5)
-                    drawn.append(values)
-            for row, band in bands.items():
-                draw_band(axes, band.index, *band.to_numpy().T, **look(row), marker="o", ms=3.5)
-            axes.set(xscale="log", yscale="log", xlabel="horizon (steps)", ylabel=_label(quantity))
-            axes.set_xticks(horizons, [f"{horizon:g}" for horizon in horizons])
-            axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5)))
-            axes.yaxis.set_major_formatter("{x:g}")
-            for axis in (axes.xaxis, axes.yaxis):
-                axis.set_minor_locator(NullLocator())
-        handles, labels = grid[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside right center", handlelength=2.4)
-        return figure
+    figure = Figure(figsize=(1.7 + 2.9 * len(quantities), 3.3), layout="constrained")
+    grid = figure.subplots(1, len(quantities), squeeze=False)[0]
+    for axes, quantity in zip(grid, quantities, strict=True):
+        bands = {row: means.loc[(row, "grounded", quantity)] for row in rows}
+        drawn: list[Floats] = []
+        for row in rows:
+            raw = means.loc[(row, "raw", quantity)]
+            values = raw.to_numpy().T
+            if not any(np.allclose(values, seen, rtol=SAME, equal_nan=True) for seen in drawn):
+                label = None if drawn else "no grounding"
+                draw_band(axes, raw.index, *values, color=INK, ls=":", label=label, marker="o", ms=3.5)
+                drawn.append(values)
+        for row, band in bands.items():
+            draw_band(axes, band.index, *band.to_numpy().T, **look(row), marker="o", ms=3.5)
+        axes.set(xscale="log", yscale="log", xlabel="horizon (steps)", ylabel=_label(quantity))
+        axes.set_xticks(horizons, [f"{horizon:g}" for horizon in horizons])
+        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5)))
+        axes.yaxis.set_major_formatter("{x:g}")
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_minor_locator(NullLocator())
+    handles, labels = grid[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside right center", handlelength=2.4)
+    return figure
 
 
 def _label(quantity: str) -> str:
     unit = next((unit for unit in _UNITS if quantity.endswith(unit)), "")
-    name = f"{quantity.removesuffix(unit).replace('_', ' ')} error"
-    return f"{name} ({_UNITS[unit]})" if unit else name
+    name = quantity.removesuffix(unit).replace("_", " ")
+    return f"{name} error ({_UNITS[unit]})" if unit else f"{name} error"
 
 
 _TICKS = (0.01, 0.1, 0.3, 0.6, 1.0)
 
 
-def reliability_of(results: Results, _: Scene) -> Figure | None:
-    """Draw the `reliability` of the groundings of results; None where none predicts failures."""
-    rates = results.failure_rates()
-    return reliability(rates) if rates else None
-
-
+@style()
 def reliability(parts: Mapping[str, Mapping[str, Floats]]) -> Figure:
     """Draw observed against predicted rates of `parts`, by their square roots, above the number of steps at each."""
-    with style():
-        figure = Figure(figsize=(1.9 + 2.7 * len(parts), 4.2), layout="constrained")
-        above, below = figure.subplots(
-            2, len(parts), squeeze=False, sharex=True, sharey="row", height_ratios=[2.6, 1.0]
-        )
-        handles: dict[str, Line2D] = {}
-        for (title, rates), axes, counts in zip(parts.items(), above, below, strict=True):
-            axes.plot([0, 1], [0, 1], color=FAINT, ls="--", lw=0.9, zorder=1)
-            for row, (predicted, observed, steps) in rates.items():
-                drawn = axes.plot(predicted, observed, marker="o", ms=4, clip_on=False, **look(row))
-                handles.setdefault(method_title(row), drawn[0])
-                counts.plot(predicted, steps, marker="o", ms=4, **look(row))
-            axes.set_title(title, loc="left")
-            _by_square_root(axes)
-            counts.set(yscale="log", xlabel="predicted rate")
-            for each in (axes, counts):
-                each.grid(visible=True, axis="both")
-        above[0].set_ylabel("observed rate")
-        below[0].set_ylabel("steps")
-        figure.legend([*handles.values()], [*handles], loc="outside right center")
-        return figure
 
-
-def _by_square_root(axes: Axes) -> None:
     def root(values: Floats) -> Floats:
-        roots: Floats = np.sqrt(np.maximum(values, 0.0))
-        return roots
+        return np.asarray(np.sqrt(np.maximum(values, 0.0)))
 
-    labels = [f"{tick:g}" for tick in _TICKS]
-    axes.set_xscale("function", functions=(root, np.square))
-    axes.set_yscale("function", functions=(root, np.square))
-    axes.set(xlim=(0.0, 1.0), ylim=(0.0, 1.0))
-    axes.set_xticks(_TICKS, labels)
-    axes.set_yticks(_TICKS, labels)
+    figure = Figure(figsize=(1.9 + 2.7 * len(parts), 4.2), layout="constrained")
+    above, below = figure.subplots(2, len(parts), squeeze=False, sharex=True, sharey="row", height_ratios=[2.6, 1.0])
+    handles: dict[str, Line2D] = {}
+    for (title, rates), axes, counts in zip(parts.items(), above, below, strict=True):
+        axes.plot([0, 1], [0, 1], color=FAINT, ls="--", lw=0.9, zorder=1)
+        for row, (predicted, observed, steps) in rates.items():
+            drawn = axes.plot(predicted, observed, marker="o", ms=4, clip_on=False, **look(row))
+            handles.setdefault(method_title(row), drawn[0])
+            counts.plot(predicted, steps, marker="o", ms=4, **look(row))
+        axes.set_title(title, loc="left")
+        for scale, set_ticks in ((axes.set_xscale, axes.set_xticks), (axes.set_yscale, axes.set_yticks)):
+            scale("function", functions=(root, np.square))
+            set_ticks(_TICKS, [f"{tick:g}" for tick in _TICKS])
+        axes.set(xlim=(0.0, 1.0), ylim=(0.0, 1.0))
+        counts.set(yscale="log", xlabel="predicted rate")
+        for each in (axes, counts):
+            each.grid(visible=True, axis="both")
+    above[0].set_ylabel("observed rate")
+    below[0].set_ylabel("steps")
+    figure.legend([*handles.values()], [*handles], loc="outside right center")
+    return figure
 
 
+@style()
 def predictive_validity(results: Results, _: Scene) -> Figure | None:
     """Draw the return in the target against that in each simulator; on the dashed line they are equal."""
     worlds = [world for world in SHARED_WORLDS if any(line.where == world for line in results.lines)]
     if results.tested_in != "target" or not worlds:
         return None
     rows = results.tested()
-    with style():
-        height = max(3.7, 0.6 + 0.19 * len(rows))
-        figure = Figure(figsize=(2.4 + 3.0 * len(worlds), height), layout="constrained")
-        grid = figure.subplots(1, len(worlds), squeeze=False, sharey=True)[0]
-        handles: dict[str, Line2D] = {}
-        for axes, world in zip(grid, worlds, strict=True):
-            axes.axline((0, 0), slope=1, color=FAINT, ls="--", lw=0.9, zorder=1)
-            for row in rows:
-                target, there = results.values(row, "return"), results.values(row, "return", world)
-                shared = [seed for seed in there if seed in target]
-                if shared:
-                    sides = ([of[seed] for seed in shared] for of in (there, target))
-                    drawing = {"color": method_color(row), "mec": "white", "mew": 0.6, "ms": 6}
-                    drawn = axes.plot(*sides, "^" if is_plus(row) else "o", **drawing)
-                    handles[method_title(row)] = drawn[0]
-            axes.set_title(f"{world} simulator".capitalize(), loc="left")
-            axes.set_xlabel("return in this simulator")
-            axes.grid(visible=True, axis="both")
-        grid[0].set_ylabel("return in the target")
-        figure.legend([*handles.values()], [*handles], loc="outside right center")
-        return figure
+    height = max(3.7, 0.6 + 0.19 * len(rows))
+    figure = Figure(figsize=(2.4 + 3.0 * len(worlds), height), layout="constrained")
+    grid = figure.subplots(1, len(worlds), squeeze=False, sharey=True)[0]
+    handles: dict[str, Line2D] = {}
+    for axes, world in zip(grid, worlds, strict=True):
+        axes.axline((0, 0), slope=1, color=FAINT, ls="--", lw=0.9, zorder=1)
+        for row in rows:
+            target, there = results.values(row, "return"), results.values(row, "return", world)
+            shared = [seed for seed in there if seed in target]
+            if shared:
+                sides = ([of[seed] for seed in shared] for of in (there, target))
+                drawing = {"color": method_color(row), "mec": "white", "mew": 0.6, "ms": 6}
+                drawn = axes.plot(*sides, "^" if is_plus(row) else "o", **drawing)
+                handles[method_title(row)] = drawn[0]
+        axes.set_title(f"{world} simulator".capitalize(), loc="left")
+        axes.set_xlabel("return in this simulator")
+        axes.grid(visible=True, axis="both")
+    grid[0].set_ylabel("return in the target")
+    figure.legend([*handles.values()], [*handles], loc="outside right center")
+    return figure

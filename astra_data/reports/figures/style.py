@@ -32,36 +32,7 @@ SIMULATED, DEPLOYED = "#E07B00", "#0060A8"
 """A simulator and the target environment, in every figure (as in the paper's Fig. 3)."""
 INK, FAINT, WALL = "#2B2B2B", "#8A8A8A", "#D9D9D6"
 
-_RC = {
-    "font.family": "DejaVu Sans",
-    "font.size": 9.0,
-    "axes.titlesize": 10.0,
-    "axes.titleweight": "bold",
-    "axes.labelsize": 9.0,
-    "axes.edgecolor": FAINT,
-    "axes.labelcolor": INK,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.axisbelow": True,
-    "axes.grid": True,
-    "axes.grid.axis": "y",
-    "grid.color": "#E8E8E6",
-    "grid.linewidth": 0.8,
-    "text.color": INK,
-    "xtick.color": FAINT,
-    "ytick.color": FAINT,
-    "xtick.labelcolor": INK,
-    "ytick.labelcolor": INK,
-    "xtick.labelsize": 8.5,
-    "ytick.labelsize": 8.5,
-    "legend.frameon": False,
-    "legend.fontsize": 8.5,
-    "lines.linewidth": 1.8,
-    "lines.solid_capstyle": "round",
-    "hatch.linewidth": 0.9,
-    "figure.facecolor": "white",
-    "figure.dpi": 200,
-}
+_STYLE = Path(__file__).with_name("astra_data.mplstyle")
 
 
 @dataclass(frozen=True)
@@ -86,7 +57,7 @@ class Scene:
 @contextmanager
 def style() -> Iterator[None]:
     """Draw in the figures' style, whatever the caller's matplotlib settings are."""
-    with context(_RC, after_reset=True):
+    with context(_STYLE, after_reset=True):
         yield
 
 
@@ -135,15 +106,15 @@ def png(figure: Figure) -> bytes:
     return small.getvalue()
 
 
+@style()
 def coverage(counts: Ints, extent: tuple[float, float, float, float], label: str, unit: str) -> Figure:
     """Draw how often the cells [y, x] of a plane, from the lower left, were visited; those never visited stay white."""
-    with style():
-        figure = Figure(figsize=(4.2, 3.6), layout="constrained")
-        axes = figure.subplots()
-        image = draw_visits(axes, counts, extent, int(counts.max()))
-        axes.set_xlabel(f"x {label} ({unit})")
-        axes.set_ylabel(f"y {label} ({unit})")
-        figure.colorbar(image, ax=axes, label="steps")
+    figure = Figure(figsize=(4.2, 3.6), layout="constrained")
+    axes = figure.subplots()
+    image = draw_visits(axes, counts, extent, int(counts.max()))
+    axes.set_xlabel(f"x {label} ({unit})")
+    axes.set_ylabel(f"y {label} ({unit})")
+    figure.colorbar(image, ax=axes, label="steps")
     return figure
 
 

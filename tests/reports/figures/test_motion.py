@@ -16,7 +16,6 @@ from torch import Tensor
 
 from astra_data.core.errors import BadInputError
 from astra_data.reports.figures.motion import (
-    CommandReplay,
     can_replay,
     dynamics_mismatch,
     replay_commands,
@@ -179,7 +178,7 @@ def test_each_axis_of_a_mismatch_has_its_own_values_and_bands() -> None:
     command = np.tile([0.8, -0.5], (3, 1))
     target = simulated + shift
     target[1:, 2] = np.nan  # all but one have fallen before the last step, where the mean is its own
-    figure = dynamics_mismatch(CommandReplay(time_s, command, simulated, simulated + shift))
+    figure = dynamics_mismatch(time_s, command, simulated, simulated + shift)
     x, y, speed, sent = figure.axes
     labels = [axes.get_ylabel() for axes in figure.axes]
     assert labels == ["x (m)", "y (m)", "speed (m/s)", "command (±1 per axis)"]
@@ -187,7 +186,7 @@ def test_each_axis_of_a_mismatch_has_its_own_values_and_bands() -> None:
     assert np.asarray(speed.lines[1].get_ydata()) == pytest.approx(5.0)
     # A command holds during the step that ends at its time.
     assert [line.get_drawstyle() for line in sent.lines] == ["steps-pre"] * 2
-    means = [dynamics_mismatch(CommandReplay(time_s, command, simulated, target)).axes[0].lines[0].get_ydata()]
+    means = [dynamics_mismatch(time_s, command, simulated, target).axes[0].lines[0].get_ydata()]
     assert np.asarray(means)[0] == pytest.approx([51.0, 51.0, 1.0])
     for axes, at, apart in ((x, 1.0, 1.0), (y, 2.0, 2.0)):
         mean, one = (np.asarray(line.get_ydata()) for line in axes.lines)
@@ -202,17 +201,17 @@ def test_each_axis_of_a_mismatch_has_its_own_values_and_bands() -> None:
 def test_simulator_and_target_are_sent_the_same_commands_from_the_same_place(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("astra_data.reports.figures.motion._ROBOTS", 8)
     task = TASKS["nao-navigation"]
-    replay = replay_commands(task)
-    steps = len(replay.time_s)
-    assert replay.time_s[0] == pytest.approx(task.timestep_s) and replay.command.shape == (steps, 2)
-    assert replay.simulated.shape == (steps, 4) and replay.target.shape == (8, steps, 4)
+    time_s, command, simulated, target = replay_commands(task)
+    steps = len(time_s)
+    assert time_s[0] == pytest.approx(task.timestep_s) and command.shape == (steps, 2)
+    assert simulated.shape == (steps, 4) and target.shape == (8, steps, 4)
     start = task.maze.cell_center(*task.maze.start)
     # 0.8 of 0.25 m/s for ten control steps of 0.192 s, and back again in the end.
-    way = replay.simulated[:, :2] - replay.simulated[0, :2]
+    way = simulated[:, :2] - simulated[0, :2]
     assert way[9] == pytest.approx([0.2 * 9 * 0.192, 0.0], abs=1e-5)
     assert way[-1] == pytest.approx([-0.2 * 0.192, 0.0], abs=1e-5)
-    assert replay.simulated[0, :2] == pytest.approx(start, abs=0.2)
-    assert replay.target[:, 0, :2].mean(axis=0) == pytest.approx(start, abs=0.05)
+    assert simulated[0, :2] == pytest.approx(start, abs=0.2)
+    assert target[:, 0, :2].mean(axis=0) == pytest.approx(start, abs=0.05)
 
 
 def test_who_has_fallen_is_no_longer_seen(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -229,7 +228,7 @@ def test_who_has_fallen_is_no_longer_seen(monkeypatch: pytest.MonkeyPatch) -> No
 
     monkeypatch.setattr(NaoEnv, "step", falling)
     monkeypatch.setattr("astra_data.reports.figures.motion._ROBOTS", 8)
-    gone = np.isnan(replay_commands(task).target)
+    gone = np.isnan(replay_commands(task)[3])
     expected = np.zeros_like(gone)
     expected[3, 8:] = expected[0, 21:] = True
     assert (gone == expected).all()

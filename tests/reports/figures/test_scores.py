@@ -40,7 +40,7 @@ def test_bars_show_mean_interval_seeds_and_the_own_simulator(scene: Scene) -> No
         *(line("astra_plus", seed, success=share) for seed, share in enumerate((0.0, 0.03, 0.06))),
         *(line("astra_plus", seed, SIMULATED, success=1.0) for seed in range(3)),
     )
-    figure = drawn(score_bars("success")(found, scene))
+    figure = drawn(score_bars(found, scene, measure="success"))
     (axes,) = figure.axes
     # The number of a bar stands beside its name: a diamond at 1.00 is not taken for what it says.
     labels = [text.get_text() for text in axes.get_yticklabels()]
@@ -53,16 +53,16 @@ def test_bars_show_mean_interval_seeds_and_the_own_simulator(scene: Scene) -> No
     (diamond,) = [of for of in axes.lines if of.get_marker() == "D"]
     assert np.asarray(diamond.get_xydata()).tolist() == [[1.0, 1.0]]
     assert axes.get_xlim() == (0.0, 1.0) and axes.get_xlabel() == "success rate in the target"
-    assert "in its own simulator" in legend(figure) and score_bars("return")(found, scene) is None
+    assert "in its own simulator" in legend(figure) and score_bars(found, scene, measure="return") is None
 
 
 def test_seeds_without_interval_and_scores_without_limit(scene: Scene) -> None:
     values: dict[str, Any] = {"steps": 300.0, "return": 1.0}
     found = results(line("nas", 0, **values), scores=(SURVIVED_STEPS, RETURN))
-    figure = drawn(score_bars("steps")(found, scene))
+    figure = drawn(score_bars(found, scene, measure="steps"))
     assert not [of for of in figure.axes[0].lines if len(np.asarray(of.get_xdata())) == 2]
     assert figure.axes[0].get_xlim()[1] > 300 and "in its own simulator" not in legend(figure)
-    assert drawn(score_bars("return")(found, scene)).axes[0].get_yticklabels()[0].get_text() == "NAS   1.0"
+    assert drawn(score_bars(found, scene, measure="return")).axes[0].get_yticklabels()[0].get_text() == "NAS   1.0"
 
 
 def training(row: str, seed: int, *scores: float) -> TrainingFacts:

@@ -20,7 +20,7 @@ ROWS = ("direct_transfer", "nas", "astra", "direct_transfer_plus", "nas_plus", "
 def bars(*rows: str) -> Figure:
     lines = [Line(row=row, seed=0, where=TESTED, values={"success": 0.5}) for row in rows]
     results = Results(recipe="r", task="t", command="", rows=rows, episodes=1, lines=lines)
-    figure = score_bars("success")(results, Scene(Path(), TASKS["antmaze-umaze"]))
+    figure = score_bars(results, Scene(Path(), TASKS["antmaze-umaze"]), measure="success")
     assert figure is not None
     return figure
 
