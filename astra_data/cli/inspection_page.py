@@ -32,28 +32,19 @@ def inspection_page(inspection: Inspection, checkup: Checkup) -> RenderableType:
     return Group(*parts)
 
 
-def sparkline(counts: Ints) -> str:
+def sparkline(counts: Ints, characters: str = _BARS) -> str:
     """Draw counts (n,) as n bars; only empty bins are blank."""
-    return _drawn(counts, _BARS)
+    levels = np.ceil(counts / max(float(counts.max()), 1e-12) * (len(characters) - 1)).astype(int)
+    return "".join(characters[level] for level in levels)
 
 
 def shaded(planar: Map) -> str:
     """Draw a map as lines of shades, the top first; a character is about as tall as two cells are wide."""
-    counts = planar.counts
-    if len(counts) % 2:
-        counts = np.concatenate([counts, np.zeros_like(counts[:1])])
-    pairs = counts[::2] + counts[1::2]
+    counts = np.pad(planar.counts, ((0, len(planar.counts) % 2), (0, 0)))
     # Square roots, so that places where the robot rested do not outshine all others.
-    drawn = _drawn(np.sqrt(pairs).ravel(), _SHADES)
-    width = counts.shape[1]
-    rows = [drawn[start : start + width] for start in range(0, len(drawn), width)]
-    return "\n".join(row.rstrip() for row in reversed(rows))
-
-
-def _drawn(counts: Ints, characters: str) -> str:
-    most = max(float(counts.max()), 1e-12)
-    levels = np.ceil(counts / most * (len(characters) - 1)).astype(int)
-    return "".join(characters[level] for level in levels)
+    pairs = np.sqrt(counts[::2] + counts[1::2])
+    drawn, width = sparkline(pairs.ravel(), _SHADES), pairs.shape[1]
+    return "\n".join(drawn[at : at + width].rstrip() for at in reversed(range(0, len(drawn), width)))
 
 
 def _summary(inspection: Inspection) -> str:

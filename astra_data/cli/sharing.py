@@ -12,37 +12,36 @@ NotesPath = Annotated[
     Path | None,
     typer.Option("--notes", help="TOML file: license, summary, behavior, intended_use, limits.", show_default="none"),
 ]
-Recordings = Annotated[list[Path], typer.Argument(metavar="SOURCE", help="Files, folders or archives of one format.")]
-MappingFile = Annotated[
-    Path | None,
-    typer.Option("--mapping", help="TOML file: which fields become which columns. D4RL, Minari and others need none."),
-]
-FileFormat = Annotated[
-    str | None,
-    typer.Option("--format", help="csv, hdf5, json, mcap, minari, npz, parquet or torch.", show_default="by name"),
-]
-Name = Annotated[str | None, typer.Option(help="Name of the dataset.", show_default="the mapping's")]
-Fps = Annotated[int | None, typer.Option(min=1, help="Steps per second.", show_default="the mapping's")]
-Task = Annotated[str | None, typer.Option(help="What the robot does in the episodes.", show_default="the mapping's")]
-MaxBytes = Annotated[
-    int | None,
-    typer.Option(min=1, help="Refuse what unpacks to more bytes.", show_default="100 times their size, or 256 MB"),
-]
-SkipBad = Annotated[
-    bool, typer.Option("--skip-bad", help="Skip files and episodes that cannot be imported and list them at the end.")
-]
 
 
 def import_(
-    recordings: Recordings,
-    mapping: MappingFile = None,
-    file_format: FileFormat = None,
+    recordings: Annotated[
+        list[Path], typer.Argument(metavar="SOURCE", help="Files, folders or archives of one format.")
+    ],
+    mapping: Annotated[
+        Path | None,
+        typer.Option(
+            "--mapping", help="TOML file: which fields become which columns. D4RL, Minari and others need none."
+        ),
+    ] = None,
+    file_format: Annotated[
+        str | None,
+        typer.Option("--format", help="csv, hdf5, json, mcap, minari, npz, parquet or torch.", show_default="by name"),
+    ] = None,
     out: Out = None,
-    name: Name = None,
-    fps: Fps = None,
-    task: Task = None,
-    max_bytes: MaxBytes = None,
-    skip_bad: SkipBad = False,
+    name: Annotated[str | None, typer.Option(help="Name of the dataset.", show_default="the mapping's")] = None,
+    fps: Annotated[int | None, typer.Option(min=1, help="Steps per second.", show_default="the mapping's")] = None,
+    task: Annotated[
+        str | None, typer.Option(help="What the robot does in the episodes.", show_default="the mapping's")
+    ] = None,
+    max_bytes: Annotated[
+        int | None,
+        typer.Option(min=1, help="Refuse what unpacks to more bytes.", show_default="100 times their size, or 256 MB"),
+    ] = None,
+    skip_bad: Annotated[
+        bool,
+        typer.Option("--skip-bad", help="Skip files and episodes that cannot be imported and list them at the end."),
+    ] = False,
 ) -> None:
     """Convert logs (CSV, NPZ, HDF5, Parquet, Minari, MCAP, JSON, PyTorch) to a dataset."""
     from astra_data.core.naming import printable

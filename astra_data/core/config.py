@@ -178,30 +178,30 @@ _EXPECTED = {
 
 
 def _fault(error: ErrorDetails, model: type[BaseModel]) -> str:
-    location = error["loc"]
-    kind, message = error["type"], error["msg"].removeprefix("Value error, ")
+    location, kind, message = error["loc"], error["type"], error["msg"].removeprefix("Value error, ")
     if not location:  # the message names the keys
         return message
     key = ".".join(str(part) for part in location if not _is_choice(part))
-    if kind == "extra_forbidden":
-        return f"{key}: unknown key{_key_hint(location, model)}"
-    if kind == "union_tag_invalid":
-        context = error["ctx"]
-        known, got = (context[name].replace("<", "").replace(">", "") for name in ("expected_tags", "tag"))
-        choices = known.replace(", ", " or ")
-        return f"{key}.{context['discriminator'].strip('()_')}: expected {choices}, got '{got}'"
-    if kind == "missing":
-        message = "expected a value, but the key is missing"
-    if kind in ("missing", "value_error"):
-        return f"{key}: {message}"
-    if kind == "too_short":
-        least, got = error["ctx"]["min_length"], error["ctx"]["actual_length"]
-        return f"{key}: expected {least} or more, got {got or 'none'}"
-    expected = _EXPECTED.get(kind) or message.removeprefix("Input should be ")
-    if expected == message:
-        return f"{key}: {message[0].lower()}{message[1:]}"
-    given = list(error["input"]) if isinstance(error["input"], tuple) else error["input"]
-    return f"{key}: expected {expected}, got {shortened(repr(given), 60)}"
+    match kind:
+        case "extra_forbidden":
+            message = f"unknown key{_key_hint(location, model)}"
+        case "union_tag_invalid":
+            context = error["ctx"]
+            known, got = (context[name].replace("<", "").replace(">", "") for name in ("expected_tags", "tag"))
+            key = f"{key}.{context['discriminator'].strip('()_')}"
+            message = f"expected {known.replace(', ', ' or ')}, got '{got}'"
+        case "missing":
+            message = "expected a value, but the key is missing"
+        case "too_short":
+            least, got = error["ctx"]["min_length"], error["ctx"]["actual_length"]
+            message = f"expected {least} or more, got {got or 'none'}"
+        case _ if kind in _EXPECTED or message.startswith("Input should be "):
+            given = list(error["input"]) if isinstance(error["input"], tuple) else error["input"]
+            expected = _EXPECTED.get(kind, message.removeprefix("Input should be "))
+            message = f"expected {expected}, got {shortened(repr(given), 60)}"
+        case _ if kind != "value_error":
+            message = f"{message[0].lower()}{message[1:]}"
+    return f"{key}: {message}"
 
 
 def _key_hint(location: tuple[int | str, ...], model: type[BaseModel]) -> str:

@@ -73,7 +73,7 @@ def write_graph(deployed: RunningPolicy, folder: Path) -> tuple[dict[str, int], 
         except Exception as error:
             raise _not_traceable(deployed, error) from error
     (folder / ONNX).write_bytes(model.SerializeToString(deterministic=True))
-    return graph.parts, _apart(graph, load_onnx(folder / ONNX), ONNX)
+    return graph.parts, _apart(graph, load_onnx(folder / ONNX))
 
 
 def load_onnx(path: Path) -> Graph:
@@ -133,17 +133,14 @@ def _not_traceable(deployed: RunningPolicy, error: Exception) -> BadInputError:
     )
 
 
-def _apart(graph: PolicyGraph, written: Graph, name: str) -> float:
+def _apart(graph: PolicyGraph, written: Graph) -> float:
     """Return how far the commands of a written graph are from the policy's, for random states and goals.
 
     States without a command do not count: φ may have none, as of an angle by its sine.
     """
-    rng = np.random.default_rng(0)
-    deployed = graph._deployed
-    state, goal, hidden = graph.example
+    rng, deployed, (state, goal, hidden), largest = np.random.default_rng(0), graph._deployed, graph.example, 0.0
     low, high = torch.tensor(list(deployed.task.limits.values())).unbind(-1)
     deployed.start(1)
-    largest = 0.0
     for step in range(_COMPARED_STEPS):
         before = deployed.memory
         for _ in range(_MOST_DRAWS):
@@ -161,7 +158,7 @@ def _apart(graph: PolicyGraph, written: Graph, name: str) -> float:
         apart = float(((command - expected).abs() * 2 / (high - low)).max())
         if not apart <= TOLERANCE:
             raise BadInputError(
-                f"{deployed.task.name}: in step {step} {name} gives the command {command[0].tolist()}, the "
+                f"{deployed.task.name}: in step {step} {ONNX} gives the command {command[0].tolist()}, the "
                 f"policy {expected[0].tolist()}: does φ or the objective depend on more than its arguments?"
             )
         largest = max(largest, apart)

@@ -194,18 +194,13 @@ def read_json[T: Artifact](model: type[T], path: Path) -> T:
 
 def read_tensors(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[np.float64]]:
     """Read a safetensors file that holds at least `names`, or raise a BadInputError."""
-    from safetensors import SafetensorError  # noqa: PLC0415
-    from safetensors.numpy import load_file  # noqa: PLC0415
+    from astra_data.core.checkpoint import load_tensors  # noqa: PLC0415 - figures of datasets do without torch
 
-    check_intact(path)
-    try:
-        tensors = load_file(path)
-    except SafetensorError as error:
-        raise BadInputError(f"{path} is not a complete safetensors file ({error}); run its stage again") from None
+    tensors, _ = load_tensors(path)
     missing = [name for name in names if name not in tensors]
     if missing:
         raise BadInputError(f"{path}: expected tensors {missing}, got {sorted(tensors)}; run its stage again")
-    return {name: tensor.astype(np.float64) for name, tensor in tensors.items()}
+    return {name: tensor.double().numpy() for name, tensor in tensors.items()}
 
 
 def way_to_success(path: Path, evaluation: Evaluation) -> float:

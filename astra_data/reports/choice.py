@@ -244,8 +244,7 @@ def choice_blocks(choice: Choice, shown: int | None = None) -> list[Text | Table
         text = "All seeds of this run have the same episodes, so no judge is independent of the policies it judges: "
         blocks.append(Text(f"{text}an error that all groundings share goes unnoticed."))
     if choice.random_regret is not None:
-        regret = "unknown (the chosen policy was not tested there)"
-        regret = regret if choice.regret is None else f"{choice.regret:.2f}"
+        regret = "unknown (the chosen policy was not tested there)" if choice.regret is None else f"{choice.regret:.2f}"
         of_random = f"of a random policy: {choice.random_regret:.2f}."
         errors = [
             [method_title(row), f"{seeds}", f"{signed:+.2f}", f"{absolute:.2f}"]

@@ -75,10 +75,13 @@ def gap_blocks(results: Results) -> Iterator[Block]:
     titles = [
         f"{steps} step{'s' if steps > 1 else ''}{f' ({steps * step_s:.3g} s)' if step_s else ''}" for steps in horizons
     ]
+    head = [*_size(results), "simulator", *titles]
     for quantity in quantities:
-        of_sizes = {percent: _error_lines(results, of, quantity, horizons) for percent, of in means.items()}
-        lines = [[*_size(results, percent), *line] for percent, of in of_sizes.items() for line in of]
-        head = [*_size(results), "simulator", *titles]
+        lines = [
+            [*_size(results, percent), *line]
+            for percent, of in means.items()
+            for line in _error_lines(results, of, quantity, horizons)
+        ]
         yield TableBlock(f"Error of `{quantity}`", head, lines, words=len(head) - len(horizons))
     last = means[max(means)]
     if still := _no_better_than_still(last):
@@ -103,16 +106,11 @@ def gap_blocks(results: Results) -> Iterator[Block]:
             "them: compare with the line without grounding of the same size."
         )
     rows = results.groundings()
-    found = {row: {name: results.summary(row, name, "ground") for name in _FITS} for row in rows}
-    if shown := [name for name in _FITS if any(of[name] for of in found.values())]:
-        yield TableBlock(
-            "R² of what groundings predict on held-out episodes (1: perfect; 0 or less: no better than the mean)",
-            ["grounding", *(_FITS[name] for name in shown)],
-            [
-                [method_title(row), *(f"{one.value:.2f}" if (one := of[name]) else "-" for name in shown)]
-                for row, of in found.items()
-            ],
-        )
+    found = {title: [results.summary(row, name, "ground") for row in rows] for name, title in _FITS.items()}
+    if shown := {title: of for title, of in found.items() if any(of)}:
+        cells = [[f"{one.value:.2f}" if one else "-" for one in of] for of in shown.values()]
+        title = "R² of what groundings predict on held-out episodes (1: perfect; 0 or less: no better than the mean)"
+        yield TableBlock(title, ["grounding", *shown], [*zip(map(method_title, rows), *cells, strict=True)])
     yield from _failure_blocks(results)
 
 

@@ -2,10 +2,12 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import permutations
 
 import numpy as np
 
 from astra_data.core.naming import base_method, is_plus, reference_of
+from astra_data.core.progress import CLOCKS
 from astra_data.methods import grounded_as, method_named, method_role, method_title
 from astra_data.reports.blocks import Block, Code, Section, TableBlock, Text, code, duration, short
 from astra_data.reports.choice import choice_blocks
@@ -95,12 +97,12 @@ def _facts(results: Results) -> Iterator[Block]:
     text += "."
     if results.leg_scale != 1:
         text += f" The target's legs are {results.leg_scale:g} times as long."
-    lacking = {
-        percent: [method_title(row) for row in results.rows if row not in results.tested(percent)]
+    unfinished = [
+        f"{', '.join(map(method_title, lacking))}{f' at {percent} %' if results.is_swept else ''}"
         for percent in results.percents
-    }
-    size = " at {} %" if results.is_swept else ""
-    if unfinished := [f"{', '.join(of)}{size.format(percent)}" for percent, of in lacking.items() if of]:
+        if (lacking := [row for row in results.rows if row not in results.tested(percent)])
+    ]
+    if unfinished:
         text += f" Not finished yet: {'; '.join(unfinished)}."
     yield Text(text)
 
@@ -118,18 +120,17 @@ def _methods(results: Results) -> Iterator[Block]:
     rows, where, headline = results.tested(), results.where, results.headline
     columns: list[tuple[str, list[str]]] = []
     for score in results.scores:
-        found = [results.summary(row, score.measure) for row in rows]
-        columns.append((f"{score.title} {where}", [spread(one, score.digits) for one in found]))
-        columns.append(("95 % interval", [ends(one, score.digits) for one in found]))
+        for title, write in ((f"{score.title} {where}", spread), ("95 % interval", ends)):
+            columns.append((title, [write(results.summary(row, score.measure), score.digits) for row in rows]))
     if printed := results.paper_success:
         columns.append(("paper", [f"{printed[row]:.2f}" if row in printed else "-" for row in rows]))
     learned = [results.score_of(row, SIMULATED) for row in rows]
     columns.append(("in its simulator", [spread(one, headline.digits) for one in learned]))
-    lost = []
-    for one, there in zip(learned, map(results.score_of, rows), strict=True):
-        # A minus sign of a rounded zero says nothing.
-        less = round(one.value - there.value, headline.digits) + 0.0 if one and there else 0.0
-        lost.append(f"{less:.{headline.digits}f}" if one and there else "-")
+    # A minus sign of a rounded zero says nothing.
+    lost = [
+        f"{round(one.value - there.value, headline.digits) + 0.0:.{headline.digits}f}" if one and there else "-"
+        for one, there in zip(learned, map(results.score_of, rows), strict=True)
+    ]
     columns.append(("lost", lost))
     shown = [column for column in COLUMNS if _is_shown(results, column)]
     for column in shown:
@@ -176,14 +177,13 @@ def _comparisons(results: Results) -> Iterator[Block]:
     headline, lines = results.headline, []
     rows = [row for row in results.tested() if method_role(row) in (None, "floor")]
     scores = {row: np.array([*results.values(row, headline.measure).values()]) for row in rows}
-    for row in (row for row in rows if base_method(row) in results.compare):
-        for other in (other for other in rows if other != row):
-            if is_plus(other) != is_plus(row) and results.values(other, "success", SIMULATED):
-                continue
+    for row, other in permutations(rows, 2):
+        is_alike = is_plus(other) == is_plus(row) or not results.values(other, "success", SIMULATED)
+        if base_method(row) in results.compare and is_alike:
             better = probability_of_improvement(scores[row], scores[other])
             if better and (by := results.difference(row, other)):
-                names = (method_title(row), method_title(other))
-                lines.append([*names, interval(better), interval(by, headline.digits)])
+                shown = (interval(better), interval(by, headline.digits))
+                lines.append([method_title(row), method_title(other), *shown])
     head = ["method", "beats", "probability [95 %]", "difference, paired by seed [95 %]"]
     yield TableBlock("Probability of improvement", head, lines, words=2)
     if lines:
@@ -214,14 +214,12 @@ def _gap(results: Results) -> Iterator[Block]:
             "How far simulators drift from the target on held-out episodes when they start in its state and "
             "receive its actions: mean [95 % interval over episodes], averaged over seeds."
         )
-    yield from gap_blocks(results)
-    for section in ("failures", "gap"):
-        yield from pictures(results, section)
+    yield from (*gap_blocks(results), *pictures(results, "failures"), *pictures(results, "gap"))
 
 
 def _validity(results: Results) -> Iterator[Block]:
     """Yield how well returns in a simulator predict those in the target."""
-    lines, few = [], []
+    lines, is_few = [], False
     for world in SHARED_WORLDS if results.tested_in == "target" else ():
         pairs = [
             np.array([[there[seed], values[seed]] for seed in there if seed in values]).T
@@ -229,14 +227,11 @@ def _validity(results: Results) -> Iterator[Block]:
             if (there := results.values(row, "return", world)) and (values := results.values(row, "return"))
         ]
         policies = sum(pair.shape[1] for pair in pairs)
-        if not policies:
-            continue
-        if policies < LEAST_POLICIES:
-            few.append(world)
-            continue
-        sides = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
-        found = [correlation(*sides), correlation(*sides, ranks=True)]
-        lines.append([world, f"{policies}", *map(interval, found)])
+        if policies >= LEAST_POLICIES:
+            sides = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
+            found = [correlation(*sides, ranks=ranks) for ranks in (False, True)]
+            lines.append([world, f"{policies}", *map(interval, found)])
+        is_few |= 0 < policies < LEAST_POLICIES
     title = "Does a simulator show which policy is better? Correlation with the return in the target"
     yield TableBlock(title, ["simulator", "policies", "Pearson [95 %]", "Spearman [95 %]"], lines)
     if lines:
@@ -246,7 +241,7 @@ def _validity(results: Results) -> Iterator[Block]:
             "Each method and seed is one policy, tested from the task's starts with the task's reward. "
             f"Intervals resample methods, and seeds within each. The grounding is {grounding}."
         )
-    elif few:
+    elif is_few:
         yield Text(f"No correlation of returns is shown: it needs {LEAST_POLICIES} policies.")
     yield from pictures(results, "validity") if lines else ()
 
@@ -277,7 +272,7 @@ def _sizes(results: Results) -> Iterator[Block]:
 
 
 def _costs(results: Results) -> Iterator[Block]:
-    wall, cpu = (stage_seconds(results, clock) for clock in ("wall_seconds", "cpu_seconds"))
+    wall, cpu = (stage_seconds(results, clock) for clock in CLOCKS)
     speeds = _speeds(results)
     stages = (*DATASET_STAGES, "ground", "train", "align", "select", "evaluate")
     shown = [stage for stage in stages if stage in wall or stage in speeds]
@@ -289,10 +284,9 @@ def _costs(results: Results) -> Iterator[Block]:
     yield TableBlock("Time of each stage, added up over methods and seeds", head, [*lines, total])
     per_row = []
     for row in results.tested():
-        found = [_cost(results, stage, row, "wall_seconds") for stage in COSTED]
-        spent = [_cost(results, stage, row, "cpu_seconds") for stage in COSTED]
-        sums = [sum(value for value in of if value is not None) for of in (found, spent)]
-        per_row.append([method_title(row), *map(duration, found), *(duration(one or None) for one in sums)])
+        found, spent = ([_cost(results, stage, row, clock) for stage in COSTED] for clock in CLOCKS)
+        sums = [sum(filter(None, of)) or None for of in (found, spent)]
+        per_row.append([method_title(row), *map(duration, found + sums)])
     head = ["method", *COSTED, "in all", "CPU time"]
     yield TableBlock("Time for one seed of each method, with the grounding and alignment that it uses", head, per_row)
     yield Text(
@@ -303,11 +297,9 @@ def _costs(results: Results) -> Iterator[Block]:
 
 def _cost(results: Results, stage: str, row: str, clock: str) -> float | None:
     """Return the mean time of a stage for one seed of a method, with the training it starts from."""
-    owners = [grounded_as(row) if stage in ("ground", "align") else row]
-    if stage == "train" and (initial := method_named(row).initial):
-        owners.append(initial)
-    found = [results.summary(owner, clock, stage) for owner in owners]
-    known = [one.value for one in found if one]
+    initial = method_named(row).initial if stage == "train" else None
+    owners = filter(None, (grounded_as(row) if stage in ("ground", "align") else row, initial))
+    known = [found.value for owner in owners if (found := results.summary(owner, clock, stage))]
     return sum(known) if known else None
 
 
@@ -333,9 +325,8 @@ def _every_seed(results: Results) -> Iterator[Block]:
     found = table[(table["where"] == TESTED) & table["row"].isin(results.tested()) & is_shown]
     wide = found.pivot_table(index=["row", "percent", "seed"], columns="measure", values="value", sort=False)
     swept = results.is_swept
-    order = [key for row in results.tested() for key in wide.index if key[0] == row]
     lines = []
-    for row, percent, seed in order:
+    for row, percent, seed in sorted(wide.index, key=lambda key: results.rows.index(key[0])):
         cells = ["-" if np.isnan(value) else f"{value:.4g}" for value in wide.loc[(row, percent, seed)]]
         lines.append([method_title(row), *([f"{percent} %"] if swept else []), f"{seed}", *cells])
     names = [str(name).replace("_", " ") for name in wide.columns]

@@ -249,9 +249,8 @@ class Results(Facts):
         if self.judged is None or size not in self.percents:
             return None
         rows = self.tested(size) if self.tested_in == "target" else []
-        target = {
-            (row, seed): found for row in rows for seed, found in self.values(row, "success", percent=size).items()
-        }
+        found = {row: self.values(row, "success", percent=size) for row in rows}
+        target = {(row, seed): value for row, of in found.items() for seed, value in of.items()}
         return choice_of(self.judged, None if self.judged.percents == [None] else size, measured=target)
 
     @property
@@ -302,10 +301,8 @@ def merge(sources: Sequence[Results]) -> Results:
     facts["judges"] = [one.model_dump(exclude={"candidates"}) for one in judged]
     for what, values in facts.items():
         if any(value != values[0] for value in values):
-            raise BadInputError(
-                f"{last.recipe}: expected all merged results to be made alike, got {what} "
-                f"{' and '.join(map(str, values))}"
-            )
+            fault = f"expected all merged results to be made alike, got {what} {' and '.join(map(str, values))}"
+            raise BadInputError(f"{last.recipe}: {fault}")
     parts = {
         part: [*{one.key: one for source in sources for one in getattr(source, part)}.values()]
         for part in ("lines", "errors", "trainings")
@@ -353,10 +350,8 @@ def merged_origins(origins: Iterable[Origin]) -> list[Origin]:
     """Return every code, machine and set of packages once, with all stages that ran there."""
     merged: dict[str, Origin] = {}
     for origin in origins:
-        key = origin.model_dump_json(exclude={"stages"})
-        known = merged.get(key, origin)
-        stages = list(dict.fromkeys([*known.stages, *origin.stages]))
-        merged[key] = known.model_copy(update={"stages": stages})
+        known = merged.setdefault(origin.model_dump_json(exclude={"stages"}), origin.model_copy(update={"stages": []}))
+        known.stages.extend(stage for stage in origin.stages if stage not in known.stages)
     return list(merged.values())
 
 
@@ -370,11 +365,11 @@ def elapsed_seconds(results: Results) -> float:
     """Return for how long anything ran, in s: the union of the times of all artifacts."""
     spans, total, last = [], 0.0, -np.inf
     for line in results.lines:
-        seconds, end = line.values.get("wall_seconds", 0.0), line.values.get("finished_at")
-        if end is None:
-            total += seconds
-        else:
+        seconds = line.values.get("wall_seconds", 0.0)
+        if end := line.values.get("finished_at"):
             spans.append((end - seconds, end))
+        else:
+            total += seconds
     for begin, end in sorted(spans):
         total += max(0.0, end - max(begin, last))
         last = max(last, end)

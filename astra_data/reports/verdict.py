@@ -50,43 +50,39 @@ def verdict_of(results: Results) -> Verdict:
     worth = {row: found for row in results.tested() if (found := _worth(results, row))}
     rivals = [row for row in results.contenders() if row in worth]
     if not rivals:
-        text = "No method to deploy: all of them are references (floor or ceiling)."
-        return Verdict(None, 0, percent, text, [], [])
+        return Verdict(None, 0, percent, "No method to deploy: all of them are references (floor or ceiling).", [], [])
     best = max(rivals, key=lambda row: worth[row].value)
     floors = [row for row in worth if method_role(row) == "floor"]
     floor = max(floors, key=lambda row: worth[row].value, default=None)
     title, score = method_title(best), _text(results, worth[best])
-    lines = [("best", f"{title}: {score}")]
+    lines = [("best", f"{title}: {score}"), ("interval", _difference(results, best, floor))]
     if floor:
         note = "what no correction of the simulator reaches"
-        lines.append(("floor", f"{method_title(floor)} ({note}): {_text(results, worth[floor])}"))
-    lines.append(("interval", _difference(results, best, floor)))
-
+        lines.insert(1, ("floor", f"{method_title(floor)} ({note}): {_text(results, worth[floor])}"))
     limit = results.headline.limit
     least = -np.inf if limit is None else ENOUGH * limit
     is_beaten = floor is not None and worth[floor].value >= worth[best].value
     learned = {row: results.score_of(row, SIMULATED) for row in rivals}
-    poor = {row: found for row, found in learned.items() if found and found.value < least}
+    poor = {row: found.value for row, found in learned.items() if found and found.value < least}
     poor = dict(sorted(poor.items(), key=lambda item: item[0] not in results.compare))
     causes = [_cause(results, row) for row in poor]
     chosen, advice = None, "Deploy" if in_target else "Try first"
     first = floor if floor and is_beaten else best
-    failing = None if limit is None else _failing(results, first)
+    failed = results.summary(first, "failed") if in_target and limit is not None else None
     if worth[first].value < least:
-        why = [
-            f"{method_title(row)} did not learn its own simulator ({results.headline.text(found.value)})"
-            for row, found in poor.items()
-        ]
+        text = "{} did not learn its own simulator ({})"
+        why = [text.format(method_title(row), results.headline.text(found)) for row, found in poor.items()]
         if not why:
             why, causes = [f"the best method, {title}, has {score}"], [*_lost(results, best)]
         text = f"**Deploy none yet**: {listed(why)}."
-    elif failing:
-        text = f"**Deploy none yet**: {method_title(first)} fails in {100 * failing:.0f} % of its episodes."
+    elif failed and failed.value >= _TOO_MANY_FAILURES:
+        text = f"**Deploy none yet**: {method_title(first)} fails in {100 * failed.value:.0f} % of its episodes."
     else:
         chosen, why_it = first, ", the floor: no method does better" if is_beaten else f": {score}"
         text = f"{advice} **{method_title(first)}**{why_it}."
-    seed = _seed(results, chosen) if chosen else 0
-    return Verdict(chosen, seed, percent, text, lines, [*causes, *_limits(results, best)])
+    return Verdict(
+        chosen, _seed(results, chosen) if chosen else 0, percent, text, lines, [*causes, *_limits(results, best)]
+    )
 
 
 def _worth(results: Results, row: str) -> Estimate | None:
@@ -117,12 +113,6 @@ def _difference(results: Results, best: str, floor: str | None) -> str:
     if found.low is None or found.high is None:
         return f"{text}, of too few seeds for an interval: run {LEAST_SEEDS} or more"
     return f"{text}, 95 %" + (": these seeds do not show a difference" if found.low <= 0 <= found.high else "")
-
-
-def _failing(results: Results, row: str) -> float | None:
-    """Return the share of the episodes in the target that a method fails in, if that is too large."""
-    failed = results.summary(row, "failed") if results.tested_in == "target" else None
-    return failed.value if failed and failed.value >= _TOO_MANY_FAILURES else None
 
 
 def _cause(results: Results, row: str) -> str:
@@ -160,8 +150,7 @@ def _limits(results: Results, best: str) -> Iterator[str]:
     """Yield what limits the comparison."""
     worth, choice = results.score_of(best), results.choice()
     if worth and worth.seeds < LEAST_SEEDS:
-        count = f"{method_title(best)} has {worth.seeds}"
-        yield f"Intervals are not shown: they need {LEAST_SEEDS} seeds, {count}."
+        yield f"Intervals are not shown: they need {LEAST_SEEDS} seeds, {method_title(best)} has {worth.seeds}."
     if choice and results.tested_in == "target" and choice.best.row != best:
         yield (
             f"Without the target, the judges (simulators that did not train a policy) choose "

@@ -94,8 +94,8 @@ def test_the_graph_acts_as_the_policy_step_after_step(name: str, tmp_path: Path)
 
 def test_what_is_no_number_is_not_the_policys_command() -> None:
     graph = PolicyGraph(POLICIES["units, no goal"])
-    with pytest.raises(BadInputError, match=r"in step 0 it gives the command \[nan\], the policy"):
-        _apart(graph, lambda state, goal, hidden: (torch.full((1, 1), torch.nan), hidden), "it")
+    with pytest.raises(BadInputError, match=r"in step 0 policy.onnx gives the command \[nan\], the policy"):
+        _apart(graph, lambda state, goal, hidden: (torch.full((1, 1), torch.nan), hidden))
 
 
 def test_states_without_an_abstraction_are_not_compared(tmp_path: Path) -> None:
@@ -148,4 +148,4 @@ def test_differences_are_the_largest_in_half_ranges() -> None:
         return command + next(more, 0.0), hidden
 
     with torch.no_grad():
-        assert _apart(graph, off, "it") == pytest.approx(0.0024 / 2.5, rel=1e-2)
+        assert _apart(graph, off) == pytest.approx(0.0024 / 2.5, rel=1e-2)
