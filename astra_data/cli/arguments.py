@@ -165,17 +165,11 @@ def fields_of(place: str) -> list[tuple[Any, str]]:
     for base in model.bases:
         if isinstance(base, ast.Name) and base.id not in ("Config", "BaseModel"):
             found += fields_of(imported.get(base.id, f"{module}:{base.id}"))
-    return [*found, *_fields(model)]
-
-
-def _fields(model: ast.ClassDef) -> Iterator[tuple[Any, str]]:
     for node, after in zip(model.body, [*model.body[1:], None], strict=True):
         if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
-            match after:
-                case ast.Expr(value=ast.Constant(value=str() as text)):
-                    yield node, " ".join(text.split())
-                case _:
-                    yield node, ""
+            text = after.value.value if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant) else ""
+            found.append((node, " ".join(str(text).split())))
+    return found
 
 
 def _option(field: ast.AnnAssign, about: str) -> Parameter:

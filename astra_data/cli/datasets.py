@@ -166,17 +166,17 @@ def inspect(
         return
     from astra_data.reports.figures.style import coverage, png
 
-    maps = ((inspection.positions, "position", "m"), (inspection.velocities, "velocity", "m/s"))
-    drawn = [(planar, label, unit) for planar, label, unit in maps if planar is not None]
-    if not drawn:
+    maps = {("position", "m"): inspection.positions, ("velocity", "m/s"): inspection.velocities}
+    if not any(maps.values()):
         raise BadInputError(
             f"{inspection.reference}: expected a state with the role position or vector, found none: "
             "give its columns a role in the mapping, or leave out --plot"
         )
-    for planar, label, unit in drawn:
-        path = plot / f"{label}_coverage.png"
-        write_file(path, png(coverage(planar.counts, planar.extent, label, unit)))
-        typer.echo(f"written: {path}")
+    for (label, unit), planar in maps.items():
+        if planar:
+            path = plot / f"{label}_coverage.png"
+            write_file(path, png(coverage(planar.counts, planar.extent, label, unit)))
+            typer.echo(f"written: {path}")
 
 
 def list_(
@@ -231,7 +231,7 @@ def _list_tasks() -> None:
     for name, known in known_tasks().items():
         states = known.abstract_state.names or (f"{known.abstract_state.size} values",)
         shown = name if name in TASKS else f"{name} (installed)"
-        values = first_few(list(known.limits), _NAMED), first_few(states, _NAMED)
+        values = first_few(list(known.limits), 4), first_few(states, 4)
         table.add_row(shown, *values, "yes" if known.has_target else "no", str(known.fps))
     arguments.show_table(table)
     typer.echo(
@@ -317,12 +317,6 @@ def repair(
     typer.echo(f"finished: {printable(str(out))} ({repaired.episodes} episodes, {repaired.frames} steps)")
 
 
-_NAMED = 4
-"""Names that a row lists."""
-_SHOWN = 5
-"""Uids of episodes whose metadata differ."""
-
-
 def log(
     dataset: arguments.DatasetName,
     other: Annotated[str | None, typer.Argument(metavar="[OTHER]", help="Show how this one differs from it.")] = None,
@@ -346,7 +340,7 @@ def log(
     if found.metadata:
         if not found.values:
             typer.echo("0 episodes differ in values")
-        keys = ", ".join(f"{printable(key)} ({first_few(uids, _SHOWN)})" for key, uids in found.metadata.items())
+        keys = ", ".join(f"{printable(key)} ({first_few(uids, 5)})" for key, uids in found.metadata.items())
         different = set().union(*found.metadata.values())
         typer.echo(f"{len(different)} episodes differ in metadata: {keys}")
     for sentence in (*found.schema, *found.description):

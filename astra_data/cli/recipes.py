@@ -10,11 +10,6 @@ from astra_data.cli import arguments
 from astra_data.core.errors import AstraDataError, BadInputError
 from astra_data.core.naming import RUNS, artifact_key
 
-Publish = Annotated[
-    bool, typer.Option("--publish", help="Add the results to those in the folder results/ next to the recipe.")
-]
-Row = Annotated[str, typer.Option(metavar="ROW", help="A row of the run's recipe, such as astra_plus.")]
-
 
 def run(
     recipe: arguments.RecipePath,
@@ -157,7 +152,12 @@ def evaluate(
 
 
 def report(
-    recipe: arguments.RecipePath, seeds: arguments.Seeds = None, publish: Publish = False, root: arguments.Root = RUNS
+    recipe: arguments.RecipePath,
+    seeds: arguments.Seeds = None,
+    publish: Annotated[
+        bool, typer.Option("--publish", help="Add the results to those in the folder results/ next to the recipe.")
+    ] = False,
+    root: arguments.Root = RUNS,
 ) -> None:
     """Write the recipe's tables and figures."""
     show_made(arguments.run_stage(recipe, "report", seeds=seeds, publish=publish, root=root).parent, None)
@@ -241,7 +241,7 @@ def select(
 
 def deploy(
     run: arguments.RunFolder,
-    row: Row,
+    row: Annotated[str, typer.Option(metavar="ROW", help="A row of the run's recipe, such as astra_plus.")],
     out: Annotated[Path | None, typer.Option(help="The new folder.", show_default="RUN/deploy/ROW/seed_SEED")] = None,
     seed: Annotated[int, typer.Option(help="A seed of the run's recipe.")] = 0,
     percent: Annotated[int | None, typer.Option(help="The dataset size in percent, if the recipe has several.")] = None,

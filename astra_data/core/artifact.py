@@ -109,7 +109,7 @@ class Manifest:
 
 def check_intact(path: Path) -> None:
     """Refuse a file whose bytes are not those in the manifest beside it, if there is one."""
-    manifest = _manifest_beside(path)
+    manifest = read_manifest(path.parent)
     if manifest and path.name in manifest.files and manifest.files[path.name][1] != durable.file_digest(path):
         advice = f"restore it from a copy, or remove {path.parent} and run the recipe again"
         raise BadInputError(f"{path} was altered since it was made: {advice}")
@@ -117,7 +117,7 @@ def check_intact(path: Path) -> None:
 
 def check_made_from(made: Path, read: Mapping[str, str | None]) -> None:
     """Refuse the artifact of a file `made` that was made from others than those that are `read` with it."""
-    manifest = _manifest_beside(made)
+    manifest = read_manifest(made.parent)
     made_from = manifest.made_from if manifest else {}
     if others := [name for name, digest in read.items() if digest and made_from.get(name, digest) != digest]:
         fault = f"was made from another {' and another '.join(others)} than the one used with it"
@@ -145,14 +145,7 @@ def read_manifest(folder: Path) -> Manifest | None:
         files = {name: (int(file["bytes"]), str(file["sha256"])) for name, file in content["files"].items()}
         return Manifest(files, dict(content["made_from"]))
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
-        raise BadInputError(f"{MANIFEST} cannot be read ({error})") from None
-
-
-def _manifest_beside(file: Path) -> Manifest | None:
-    try:
-        return read_manifest(file.parent)
-    except BadInputError as error:
-        raise BadInputError(f"{file.parent}: {error}") from None
+        raise BadInputError(f"{MANIFEST} cannot be read in {folder} ({error})") from None
 
 
 def _files(folder: Path) -> dict[str, Path]:

@@ -206,10 +206,7 @@ def _every_run(root: Path, columns: Sequence[plain.PlainColumn]) -> Iterator[pla
 
 @dataclass
 class EpisodeChecks:
-    """Reads all episodes once, one in memory at a time.
-
-    Where there are `digests`, values are compared with them, else statistics with values.
-    """
+    """Reads all episodes once, one in memory at a time; compares values with `digests` or, without, statistics."""
 
     root: Path
     info: Mapping[str, Any]
@@ -221,8 +218,8 @@ class EpisodeChecks:
 
     def run(self) -> None:
         """Check every episode, and what is counted over all of them."""
-        report, first, tasks = self.report, dict[int, int](), plain.read_tasks(self.root)
-        if isinstance(tasks, str):
+        report, first = self.report, dict[int, int]()
+        if isinstance(tasks := plain.read_tasks(self.root), str):
             report.fault("tasks", f"{layout.TASKS_PATH} {tasks}")
         else:
             self.tasks = tasks
@@ -248,7 +245,12 @@ class EpisodeChecks:
         if not report.frames:
             report.fault("values", "there are no steps")
         elif not self.digests:
-            self._check_global()
+            stored = plain.read_object(self.root / layout.STATS_PATH)
+            if isinstance(stored, str):
+                report.fault("statistics", f"{layout.STATS_PATH} {stored}")
+            elif self.total:
+                of = {name: each for name, each in stored.items() if isinstance(each, dict)}
+                self._compare(lambda name, kind: of.get(name, {}).get(kind), self.total, "")
 
     def _check_run(self, number: int, run: plain.Run) -> None:
         report = self.report
@@ -257,8 +259,7 @@ class EpisodeChecks:
         for faults in (plain.flag_faults, plain.open_end_faults):
             for fault in faults(run.columns, f"episode {number} "):
                 report.note("flags", fault)
-        unknown = [t for t in np.unique(run.columns[names.TASK_INDEX]).tolist() if t not in self.tasks]
-        if unknown:
+        if unknown := [t for t in np.unique(run.columns[names.TASK_INDEX]).tolist() if t not in self.tasks]:
             report.fault("tasks", f"episode {number} has the unknown tasks {unknown}")
         if altered := described.altered_columns(run.columns, number, self.digests):
             report.fault("values", described.alteration(altered, run.path, run.row, len(run), number))
@@ -274,12 +275,9 @@ class EpisodeChecks:
             "length": (row.get("length"), len(run)),
             "dataset_from_index": (row.get("dataset_from_index"), start),
             "dataset_to_index": (row.get("dataset_to_index"), start + len(run)),
-            "the file": (
-                self.info["data_path"].format(**place) if known else None,
-                str(run.path.relative_to(self.root)),
-            ),
         }
-        listed = row.get("tasks")
+        named, listed = self.info["data_path"].format(**place) if known else None, row.get("tasks")
+        compared["the file"] = (named, str(run.path.relative_to(self.root)))
         if not isinstance(listed, list) or set(map(str, listed)) != set(map(str, present)):
             compared["tasks"] = (listed, present)
         for key, (found, expected) in compared.items():
@@ -305,14 +303,6 @@ class EpisodeChecks:
             "std": np.sqrt(variance + shift**2 * share * (1 - share)),
             "count": count,
         }
-
-    def _check_global(self) -> None:
-        stored = plain.read_object(self.root / layout.STATS_PATH)
-        if isinstance(stored, str):
-            self.report.fault("statistics", f"{layout.STATS_PATH} {stored}")
-        elif self.total:
-            every = {name: each for name, each in stored.items() if isinstance(each, dict)}
-            self._compare(lambda name, kind: every.get(name, {}).get(kind), self.total, "")
 
     def _compare(self, stored: Callable[[str, str], object], found: Mapping[str, Floats], where: str) -> None:
         """Note which statistics, as `stored` has them by column and kind, differ from those of the values."""

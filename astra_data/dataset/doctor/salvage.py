@@ -175,28 +175,22 @@ class _Page(NamedTuple):
     is_zstd: bool
 
 
-class _Leaf(NamedTuple):
-    """A column: values per row and bits per value."""
-
-    size: int
-    bits: int
-
-    def may_have(self, page: _Page) -> bool:
-        """Return whether `page` may belong to it: does the size match that of values of its width?"""
-        least = page.values * self.bits // 8
-        is_fixed = page.kind != _DICTIONARY and page.encoding in _FIXED_WIDTH
-        return not is_fixed or least <= page.unpacked <= least + page.values // 2 + _HEADER
+def _may_hold(page: _Page, bits: int) -> bool:
+    """Return whether `page` may be of values of so many bits: does its size match?"""
+    least = page.values * bits // 8
+    is_fixed = page.kind != _DICTIONARY and page.encoding in _FIXED_WIDTH
+    return not is_fixed or least <= page.unpacked <= least + page.values // 2 + _HEADER
 
 
 def rebuilt_metadata(path: Path, schema: pa.Schema) -> pq.FileMetaData:
     """Return the metadata of all whole row groups of the parquet file at `path`, for `ParquetFile(metadata=...)`."""
-    leaves = []
+    leaves: list[tuple[int, int]] = []  # values per row, and bits per value
     for field in schema:
         is_list = pa.types.is_fixed_size_list(field.type)
         value = field.type.value_type if is_list else field.type
         if not pa.types.is_primitive(value):
             raise CorruptDatasetError(f"column {field.name} ({field.type}) cannot be read without a footer")
-        leaves.append(_Leaf(field.type.list_size if is_list else 1, value.bit_width))
+        leaves.append((field.type.list_size if is_list else 1, value.bit_width))
     pages, groups, first = list(_pages(path)), list[list[list[_Page]]](), 0
     while group := _row_group(pages, first, leaves):
         groups.append(group)
@@ -242,26 +236,28 @@ def _page(data: memoryview, start: int) -> _Page | None:
     return _Page(start, body + packed, unpacked + body - start, kind, values, encoding, is_zstd)
 
 
-def _row_group(pages: Sequence[_Page], first: int, leaves: Sequence[_Leaf]) -> list[list[_Page]] | None:
+def _row_group(pages: Sequence[_Page], first: int, leaves: Sequence[tuple[int, int]]) -> list[list[_Page]] | None:
     """Split the pages from `first` on into one chunk per column, of equally many rows; None if too few."""
     values = 0
     for number in range(first, len(pages)):
         if pages[number].kind == _DICTIONARY and number > first:
             return None
         values += pages[number].values
-        rows, rest = divmod(values, leaves[0].size)
+        rows, rest = divmod(values, leaves[0][0])
         if rows and not rest and (group := _chunks(pages, first, leaves, rows)):
             return group
     return None
 
 
-def _chunks(pages: Sequence[_Page], position: int, leaves: Sequence[_Leaf], rows: int) -> list[list[_Page]] | None:
+def _chunks(
+    pages: Sequence[_Page], position: int, leaves: Sequence[tuple[int, int]], rows: int
+) -> list[list[_Page]] | None:
     chunks: list[list[_Page]] = []
-    for leaf in leaves:
-        first, missing = position, rows * leaf.size
+    for size, bits in leaves:
+        first, missing = position, rows * size
         while missing > 0:
             is_next = position > first and position < len(pages) and pages[position].kind == _DICTIONARY
-            if position == len(pages) or is_next or not leaf.may_have(pages[position]):
+            if position == len(pages) or is_next or not _may_hold(pages[position], bits):
                 return None
             missing -= pages[position].values
             position += 1
@@ -271,12 +267,12 @@ def _chunks(pages: Sequence[_Page], position: int, leaves: Sequence[_Leaf], rows
     return chunks
 
 
-def _footer(template: bytes, groups: list[list[list[_Page]]], leaves: Sequence[_Leaf]) -> bytes:
+def _footer(template: bytes, groups: list[list[list[_Page]]], leaves: Sequence[tuple[int, int]]) -> bytes:
     """Return parquet's FileMetaData: the schema of `template`, a file of one row group, and `groups`."""
     length = int.from_bytes(template[-8:-4], "little")
     metadata = _decoded(template[-8 - length : -8], 0)[0]
     columns = [column[3][1] for column in metadata[4][1][1][0][1][1][1]]
-    rows = [sum(page.values for page in group[0]) // leaves[0].size for group in groups]
+    rows = [sum(page.values for page in group[0]) // leaves[0][0] for group in groups]
     row_groups: list[Struct] = []
     for count, group in zip(rows, groups, strict=True):
         chunks = [_column_chunk(column, pages) for column, pages in zip(columns, group, strict=True)]

@@ -87,12 +87,10 @@ class AstraDataPolicy(PreTrainedPolicy):  # type: ignore[misc]
 
     def _checked(self, batch: dict[str, Tensor], column: str, called: str) -> Tensor:
         names, given = self._about[called]["names"], batch.get(column)
-        if given is None:
-            came = "none"
-        elif given.ndim != 2 or given.shape[1] != len(names):
-            came = f"the shape {tuple(given.shape)}"
-        elif not given.isfinite().all():
-            came = "some that are not finite"
-        else:
+        is_shaped = given is not None and given.ndim == 2 and given.shape[1] == len(names)
+        if given is not None and is_shaped and given.isfinite().all():
             return given.float().cpu()
+        came = (
+            "some that are not finite" if is_shaped else "none" if given is None else f"the shape {tuple(given.shape)}"
+        )
         raise BadInputError(f"{column}: expected finite values (B, {len(names)}), {called} {names}, got {came}")

@@ -140,8 +140,9 @@ def _columns(dataset: Dataset) -> str:
                 wide.setdefault(labels, []).append(column.name)
             elif labels:
                 meaning = f"{meaning}: {', '.join(labels)}".removeprefix(": ")
-            shape = f"({column.size},)"
-            rows.append((in_code(column.name), column.dtype, shape, _units(column), meaning))
+            runs = [(in_markdown(unit), len([*run])) for unit, run in groupby((column.astra or {}).get("unit", []))]
+            units = ", ".join(unit if count == 1 else f"{unit} ({count})" for unit, count in runs)
+            rows.append((in_code(column.name), column.dtype, f"({column.size},)", units, meaning))
     for name, camera in dataset.cameras.items():
         kind, size = camera.feature["dtype"], ", ".join(map(str, camera.feature["shape"]))
         rows.append((in_code(name), kind, f"({size})", "", "pictures"))
@@ -155,13 +156,6 @@ def _columns(dataset: Dataset) -> str:
             f"stand in `{layout.INFO_PATH}` under `astra`.",
         ]
     )
-
-
-def _units(column: Column) -> str:
-    units = (column.astra or {}).get("unit", [])
-    runs = [(unit, len(list(run))) for unit, run in groupby(units)]
-    counted = ((in_markdown(unit), count) for unit, count in runs)
-    return ", ".join(unit if count == 1 else f"{unit} ({count})" for unit, count in counted)
 
 
 def _provenance(description: dict[str, Any]) -> str:

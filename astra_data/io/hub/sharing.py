@@ -1,7 +1,8 @@
 """Push a version of a dataset, and pull one; an interrupted push or pull is continued by the next."""
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -147,11 +148,24 @@ def pull(
         dataset = _present(target, description, sums)
         progress(1.0, f"it is there already, and whole: {len(sums)} files were compared")
         return dataset
+    too_large = f"of which at most {max_bytes} are taken. If you trust it, pass a larger --max-bytes."
+    total = sum(remote.facts(path).get("size") or 0 for path in sums)
+    if total > max_bytes:
+        raise SharingError(f"{remote.name} has {total} bytes, {too_large}")
+    partial = target.with_name(f".{target.name}.pull-{description['version']}")
     try:
-        with folder_for(target):
-            _fetch_all(remote, sums, target, description, max_bytes, progress)
+        with folder_for(target), _begun(partial, sums):
+            for number, path in enumerate(stores.altered(partial, sums)):
+                progress(number / len(sums), path)
+                max_bytes -= fetch(remote, path, partial, max_bytes + 1)
+                if max_bytes < 0:  # where the place does not know sizes
+                    (partial / path).unlink()
+                    raise SharingError(f"{remote.name} has more bytes, {too_large}")
+            _check(partial, sums, description, remote.name)
+            publish(partial, target)
     except OSError as error:
         raise BadInputError(f"{target} cannot be written ({error}); choose another folder.") from error
+    progress(1.0, f"{len(sums)} files")
     return Dataset.open(target)
 
 
@@ -160,37 +174,22 @@ def opened(data: str | Path) -> Dataset:
     return pull(str(data)) if stores.is_address(data) else open_dataset(data)
 
 
-def _fetch_all(
-    remote: stores.RemoteFolder,
-    sums: Mapping[str, str],
-    target: Path,
-    description: Mapping[str, Any],
-    max_bytes: int,
-    progress: Progress,
-) -> None:
-    """Download the files of `sums` and, once their values are verified, rename their folder to `target`."""
-    too_large = f"of which at most {max_bytes} are taken. If you trust it, pass a larger --max-bytes."
-    total = sum(remote.facts(path).get("size") or 0 for path in sums)
-    if total > max_bytes:
-        raise SharingError(f"{remote.name} has {total} bytes, {too_large}")
-    partial = target.with_name(f".{target.name}.pull-{description['version']}")
+@contextmanager
+def _begun(partial: Path, sums: Mapping[str, str]) -> Iterator[None]:
+    """Hold the folder of an unfinished download, without what is not of it; refuse links, devices and pipes."""
     partial.mkdir(parents=True, exist_ok=True)
-    refuse_planted(partial)
+    for entry in [partial, *partial.rglob("*")]:
+        is_plain = entry.is_file() and entry.lstat().st_nlink == 1
+        if entry.is_symlink() or not (entry.is_dir() or is_plain):
+            advice = f"delete {partial}, then run the same command again."
+            raise SharingError(f"{entry} is a link, a device or a pipe, which no pull leaves there: {advice}")
     with held(partial) as ours:
         if not ours:
-            raise BadInputError(f"{target} is being pulled right now; wait or choose another folder.")
+            raise BadInputError(f"{partial} is being pulled right now; wait or choose another folder.")
         for file in [file for file in partial.rglob("*") if file.is_file()]:
             if file.relative_to(partial).as_posix() not in sums:
                 file.unlink()
-        for number, path in enumerate(stores.altered(partial, sums)):
-            progress(number / len(sums), path)
-            max_bytes -= fetch(remote, path, partial, max_bytes + 1)
-            if max_bytes < 0:  # where the place does not know sizes
-                (partial / path).unlink()
-                raise SharingError(f"{remote.name} has more bytes, {too_large}")
-        _check(partial, sums, description, remote.name)
-        publish(partial, target)
-    progress(1.0, f"{len(sums)} files")
+        yield
 
 
 def fetch(remote: stores.RemoteFolder, path: str, folder: Path, most: int) -> int:
@@ -200,15 +199,6 @@ def fetch(remote: stores.RemoteFolder, path: str, folder: Path, most: int) -> in
         target.parent.mkdir(parents=True, exist_ok=True)
         with target.open("wb") as file:
             return sum(map(file.write, remote.blocks(path, most)))
-
-
-def refuse_planted(folder: Path) -> None:
-    """Raise SharingError if an unfinished `folder` has links, devices, pipes or files with a second name."""
-    for entry in [folder, *folder.rglob("*")]:
-        is_plain = entry.is_file() and entry.lstat().st_nlink == 1
-        if entry.is_symlink() or not (entry.is_dir() or is_plain):
-            advice = f"delete {folder}, then run the same command again."
-            raise SharingError(f"{entry} is a link, a device or a pipe, which no pull leaves there: {advice}")
 
 
 def _present(target: Path, description: Mapping[str, Any], sums: Mapping[str, str]) -> Dataset:
