@@ -92,7 +92,7 @@ def filter_(
 
 
 def trim(
-    dataset: DatasetName,
+    dataset: arguments.DatasetName,
     start: Annotated[float, typer.Option(min=0.0, metavar="SECONDS", help="Time to remove from the start.")] = 0.0,
     end: Annotated[float, typer.Option(min=0.0, metavar="SECONDS", help="Time to remove from the end.")] = 0.0,
     still: Annotated[
@@ -102,8 +102,8 @@ def trim(
         str | None,
         typer.Option(metavar="CONDITION", help="Remove the steps in which it holds, such as 'v < 0.05'."),
     ] = None,
-    name: NewName = None,
-    out: Out = None,
+    name: arguments.NewName = None,
+    out: arguments.Out = None,
 ) -> None:
     """Write a dataset with shorter episodes, or without some of their steps."""
     from astra_data.dataset.timing import trim as write
@@ -114,10 +114,10 @@ def trim(
 
 
 def resample(
-    dataset: DatasetName,
+    dataset: arguments.DatasetName,
     fps: Annotated[int, typer.Option(min=1, help="Steps per second of the new dataset.")],
-    name: NewName = None,
-    out: Out = None,
+    name: arguments.NewName = None,
+    out: arguments.Out = None,
 ) -> None:
     """Write a dataset at another rate: commands held, states interpolated, times true."""
     from astra_data.dataset.timing import resample as write
