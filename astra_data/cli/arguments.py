@@ -123,11 +123,7 @@ _KINDS: dict[str, Any] = {
 
 
 def with_settings(place: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Let a command take an option for each field of a model at "package.module:Model", as its source says.
-
-    The command's parameter `settings` is then given those that were typed, by their names. The model is not
-    loaded, as its module may take seconds to run.
-    """
+    """Let a command take as `settings` an option for each field of the model at "module:Model", which is not loaded."""
 
     def decorated(command: Callable[..., None]) -> Callable[..., None]:
         options = [_option(field, about) for field, about in fields_of(place)]
@@ -211,10 +207,7 @@ def resumable(how: str = "run the same command again to continue") -> Iterator[N
 
 
 def run_stage(recipe: Path, stage: str, **options: Any) -> Path:
-    """Run one stage of a recipe, and print the folder of its artifacts.
-
-    Options that are given None are left out.
-    """
+    """Run one stage of a recipe, without options that are None, and print the folder of its artifacts."""
     options = {name: value for name, value in options.items() if value is not None}
     recipe_at(recipe)
     from astra_data.pipeline.run import run_stage as run

@@ -179,12 +179,9 @@ def show_made(folder: Path, until: str | None) -> None:
     found = folder / "report" / JSON
     verdict = verdict_of(read_results(found)) if "report" in made and found.is_file() else None
     if verdict:
-        typer.echo(verdict.text.replace("**", ""))
-        for label, text in verdict.lines:
-            typer.echo(f"  {label:8}  {text}")
-        if verdict.row is None:
-            for remark in verdict.remarks:
-                typer.echo(f"  {remark}")
+        shown = [f"{label:8}  {text}" for label, text in verdict.lines]
+        remarks = verdict.remarks if verdict.row is None else []
+        typer.echo("\n  ".join([verdict.text.replace("**", ""), *shown, *remarks]))
     pages = {"ground": folder / PAGE, "report": folder / "report" / HTML, "evaluate": folder / POINTS}
     for file in (page for stage, page in pages.items() if stage in made):
         if file.is_file():

@@ -72,10 +72,7 @@ def deploy(run: Path, row: str, out: Path, *, seed: int = 0, percent: int | None
 def describe(
     deployed: RunningPolicy, parts: Mapping[str, int], recorded: tuple[Sequence[float], Sequence[float]] | None = None
 ) -> dict[str, Any]:
-    """Return what one has to know to run a policy whose hidden state has `parts` of these sizes.
-
-    `recorded` are least and largest of each value of the state in the data it was learned from, if known.
-    """
+    """Return what running a policy takes: `parts` of its hidden state, least and largest `recorded` states, names."""
     task = deployed.task
     encoders = {"target": deployed.target_encoder, "source": deployed.source_encoder}
     least, largest = zip(*task.limits.values(), strict=True)

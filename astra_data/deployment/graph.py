@@ -55,10 +55,7 @@ class PolicyGraph(nn.Module):
 
 
 def write_graph(deployed: RunningPolicy, folder: Path) -> tuple[dict[str, int], float]:
-    """Write the policy as ONNX into `folder`, and compare the file with it.
-
-    Returns the sizes of the parts of the hidden state, and the largest difference of commands, in half ranges.
-    """
+    """Write the policy as ONNX; return the sizes of its hidden state's parts, and how many half ranges it differs."""
     optional("onnxscript")
     if isinstance(deployed.policy, UserPolicy):
         raise BadInputError(
@@ -134,10 +131,7 @@ def _not_traceable(deployed: RunningPolicy, error: Exception) -> BadInputError:
 
 
 def _apart(graph: PolicyGraph, written: Graph) -> float:
-    """Return how far the commands of a written graph are from the policy's, for random states and goals.
-
-    States without a command do not count: φ may have none, as of an angle by its sine.
-    """
+    """Return how far a written graph's commands are from the policy's, in random states that have a command."""
     rng, deployed, (state, goal, hidden), largest = np.random.default_rng(0), graph._deployed, graph.example, 0.0
     low, high = torch.tensor(list(deployed.task.limits.values())).unbind(-1)
     deployed.start(1)

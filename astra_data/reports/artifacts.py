@@ -65,8 +65,7 @@ class Outcomes(WrittenPart):
 
     def means(self) -> dict[str, float]:
         """Return the mean of each measure over the episodes, by its name in the file."""
-        measures = self.model_dump(by_alias=True)
-        return {name: float(np.mean(values)) for name, values in measures.items()}
+        return {name: float(np.mean(values)) for name, values in self.model_dump(by_alias=True).items()}
 
 
 class Evaluation(Artifact):

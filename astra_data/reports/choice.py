@@ -186,35 +186,31 @@ class Choice:
         return self.measured.get((one.row, one.seed))
 
     @property
-    def tested(self) -> list[tuple[Candidate, float]]:
-        """The candidates that were tested in the target, with their success there."""
-        return [(one, found) for one in self.candidates if (found := self.target(one)) is not None]
-
-    @property
     def regret(self) -> float | None:
         """Success in the target of the best there, less that of the chosen; None where that is not tested."""
         chosen = self.target(self.best)
-        return None if chosen is None else max(found for _, found in self.tested) - chosen
+        return None if chosen is None else max(self.measured.values()) - chosen
 
     @property
     def random_regret(self) -> float | None:
         """The same of a policy drawn at random, on average; None where none is tested."""
-        found = [found for _, found in self.tested]
-        return max(found) - fmean(found) if found else None
+        return max(self.measured.values()) - fmean(self.measured.values()) if self.measured else None
 
     @property
     def calibration(self) -> dict[str, tuple[int, float, float]]:
         """Row → seeds, mean and mean absolute error of the predicted success."""
         errors: dict[str, list[float]] = {}
-        for one, found in self.tested:
-            errors.setdefault(one.row, []).append(one.predicted - found)
+        for one in self.candidates:
+            if (found := self.target(one)) is not None:
+                errors.setdefault(one.row, []).append(one.predicted - found)
         return {row: (len(of), fmean(of), fmean(map(abs, of))) for row, of in errors.items()}
 
 
 def choice_of(judged: Judgment, percent: int | None, *, measured: Mapping[tuple[str, int], float]) -> Choice | None:
     """Return the choice among the policies of a size, None for the whole; None without a candidate."""
     ranked = judged.ranked(percent)
-    return Choice(judged, ranked, measured) if ranked else None
+    tested = {key: measured[key] for one in ranked if (key := (one.row, one.seed)) in measured}
+    return Choice(judged, ranked, tested) if ranked else None
 
 
 def choice_blocks(choice: Choice, shown: int | None = None) -> list[Text | TableBlock]:

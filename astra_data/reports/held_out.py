@@ -178,11 +178,9 @@ def _sufficient_sizes(
         *smaller, largest = sorted(of)
         for quantity in quantities if smaller else ():
             at = {percent: found.loc[("grounded", quantity, horizon)] for percent, found in of.items()}
-            limit, least = at[largest]["high"], largest
-            for percent in reversed(smaller):
-                if not at[percent]["mean"] <= limit:
-                    break
-                least = percent
+            limit = at[largest]["high"]
+            above = [percent for percent in smaller if not at[percent]["mean"] <= limit]
+            least = min(percent for percent in of if percent > max(above, default=0))
             found = f"from {least} % on, the error is within the interval of {largest} %."
             if np.isnan(limit):
                 found = f"unknown: at {largest} %, a seed has only one held-out episode of that length."

@@ -75,9 +75,8 @@ class RunReader:
 
     def add[A: artifacts.Artifact](self, stage: str, owner: Owner, file: A) -> A:
         """Write down the origin and the numbers of a file."""
-        self.origins.append(
-            results.Origin(commit=file.git_commit, machine=file.machine, packages=file.packages, stages=[stage])
-        )
+        made = {"commit": file.git_commit, "machine": file.machine, "packages": file.packages}
+        self.origins.append(results.Origin.model_validate(made | {"stages": [stage]}))
         self._line(owner, stage, file.numbers())
         return file
 

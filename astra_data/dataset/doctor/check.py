@@ -331,10 +331,7 @@ def is_estimate(kind: str, stored: object, expected: Floats, largest: Floats) ->
 
 
 def compare_with_lerobot(root: Path, report: Report) -> None:
-    """Open the dataset with `LeRobotDataset` and compare windows of observations and actions with the files.
-
-    Works offline and leaves no cache behind; importing lerobot takes seconds and 0.8 GB.
-    """
+    """Compare windows with those of `LeRobotDataset`, offline and without its cache; lerobot takes 0.8 GB."""
     handlers = list(logging.getLogger().handlers)
     os.environ["HF_HUB_OFFLINE"] = "1"
     optional("lerobot")

@@ -11,10 +11,7 @@ from astra_data.deployment.folder import TYPE
 @PreTrainedConfig.register_subclass(TYPE)
 @dataclass
 class AstraDataConfig(PreTrainedConfig):  # type: ignore[misc]
-    """The sizes of state, goal and command, as they lie in the policy's folder.
-
-    The policy remembers by itself, so no other steps are asked for; LeRobot does not train it.
-    """
+    """The sizes of state, goal and command, as they lie in the policy's folder; the policy remembers by itself."""
 
     observation_delta_indices = action_delta_indices = reward_delta_indices = None
 

@@ -29,10 +29,7 @@ Array = NDArray[Any]
 @EnvConfig.register_subclass(TYPE)
 @dataclass
 class AstraDataEnv(EnvConfig):  # type: ignore[misc]
-    """The target of `task`: a name, or a place such as cart.py:TASK, whose code is run.
-
-    Its values have the names of datasets' columns, so that recordings are datasets of this package as well.
-    """
+    """The target of `task`, a name or a place such as cart.py:TASK, whose code is run; names are datasets' columns."""
 
     def __post_init__(self) -> None:
         """Take rate and sizes from the task; raise a BadInputError if none is named, or it is not known."""

@@ -1,8 +1,5 @@
 """Sharing of datasets: their cards, and push and pull to the Hugging Face Hub or any storage.
 
-Every place holds the dataset's own files and SHA256SUMS, which lists them all. The card (README.md and its
-figure) is for readers and is not downloaded.
-
-hf://datasets/<user>/<name>             on the Hugging Face Hub: one repository, a tag data-<version> each
-<url>/<name>/data-<version>/            anywhere else: s3, gs, file and whatever fsspec knows
+A place holds a dataset's files and SHA256SUMS, which lists them: a repository of the Hub, with a tag data-<version>
+each, or <url>/<name>/data-<version>/ on s3, gs, file and whatever fsspec knows. Cards are not downloaded.
 """

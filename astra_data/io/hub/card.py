@@ -44,10 +44,7 @@ class Notes(Config):
 
 
 def write_card(dataset: Dataset, out: Path, notes: Notes, *, source: str | None = None) -> list[Path]:
-    """Write the card of a verified `dataset` to `out` and, where it has planar positions, their figure beside it.
-
-    Return the files; `notes` are by hand, `source` is where it is shared. Refuse an `out` of other contents.
-    """
+    """Write the card of a verified `dataset`, shared at `source`, and its figure; refuse an `out` of other contents."""
     positions = visited(dataset)
     figure = None if positions is None else out.with_name(f"{out.stem}-coverage.png")
     text = render_card(dataset, notes, source=source, figure=figure.name if figure else None)

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import LogLocator, NullLocator
+from matplotlib.ticker import LogLocator
 
 from astra_data.core.arrays import Floats
 from astra_data.core.naming import is_plus
@@ -42,21 +42,17 @@ def open_loop_error(results: Results, _: Scene) -> Figure | None:
                 drawn.append(values)
         for row, band in bands.items():
             draw_band(axes, band.index, *band.to_numpy().T, **look(row), marker="o", ms=3.5)
-        axes.set(xscale="log", yscale="log", xlabel="horizon (steps)", ylabel=_label(quantity))
+        ending = next((ending for ending in _UNITS if quantity.endswith(ending)), "")
+        name = f"{quantity.removesuffix(ending).replace('_', ' ')} error"
+        label = f"{name} ({_UNITS[ending]})" if ending else name
+        axes.set(xscale="log", yscale="log", xlabel="horizon (steps)", ylabel=label)
         axes.set_xticks(horizons, [f"{horizon:g}" for horizon in horizons])
         axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5)))
         axes.yaxis.set_major_formatter("{x:g}")
-        for axis in (axes.xaxis, axes.yaxis):
-            axis.set_minor_locator(NullLocator())
+        axes.minorticks_off()
     handles, labels = grid[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside right center", handlelength=2.4)
     return figure
-
-
-def _label(quantity: str) -> str:
-    unit = next((unit for unit in _UNITS if quantity.endswith(unit)), "")
-    name = quantity.removesuffix(unit).replace("_", " ")
-    return f"{name} error ({_UNITS[unit]})" if unit else f"{name} error"
 
 
 _TICKS = (0.01, 0.1, 0.3, 0.6, 1.0)
@@ -99,16 +95,14 @@ def predictive_validity(results: Results, _: Scene) -> Figure | None:
     if results.tested_in != "target" or not worlds:
         return None
     rows = results.tested()
-    height = max(3.7, 0.6 + 0.19 * len(rows))
-    figure = Figure(figsize=(2.4 + 3.0 * len(worlds), height), layout="constrained")
+    figure = Figure(figsize=(2.4 + 3.0 * len(worlds), max(3.7, 0.6 + 0.19 * len(rows))), layout="constrained")
     grid = figure.subplots(1, len(worlds), squeeze=False, sharey=True)[0]
     handles: dict[str, Line2D] = {}
     for axes, world in zip(grid, worlds, strict=True):
         axes.axline((0, 0), slope=1, color=FAINT, ls="--", lw=0.9, zorder=1)
         for row in rows:
             target, there = results.values(row, "return"), results.values(row, "return", world)
-            shared = [seed for seed in there if seed in target]
-            if shared:
+            if shared := [seed for seed in there if seed in target]:
                 sides = ([of[seed] for seed in shared] for of in (there, target))
                 drawing = {"color": method_color(row), "mec": "white", "mew": 0.6, "ms": 6}
                 drawn = axes.plot(*sides, "^" if is_plus(row) else "o", **drawing)

@@ -34,8 +34,7 @@ def can_replay(task: Task) -> bool:
 def replay_commands(task: Task) -> tuple[Floats, Floats, Floats, Floats]:
     """Drive one simulated and 60 target robots from the center of the start cell by the same commands.
 
-    Return times (T,) in s, commands (T, 2), ±1 per axis, and [x, y, vx, vy] after each: simulated (T, 4), of N target
-    robots (N, T, 4).
+    Return times (T,) in s, commands (T, 2), ±1, and [x, y, vx, vy] after each: simulated (T, 4), of targets (N, T, 4).
     """
     command = np.concatenate([np.tile(velocity, (round(seconds * task.fps), 1)) for velocity, seconds in _COMMANDS])
     robots = task.target(_ROBOTS, seed=0)
@@ -93,10 +92,8 @@ def trajectories(results: Results, scene: Scene) -> Figure | None:
             _draw_paths(axes, *path)
         for x, y in _cell_means(maze, goals) if maze else ():
             axes.plot(x, y, "*", ms=13, mfc="#FFD23F", mec=INK, mew=0.8, zorder=6)
-        title = method_title(row)
-        # The number has to find room beside it.
-        size = TITLE_POINTS * min(1.0, TITLE_LETTERS / len(title))
-        axes.set_title(title, loc="left", fontsize=size)
+        title = method_title(row)  # beside which the number has to find room
+        axes.set_title(title, loc="left", fontsize=TITLE_POINTS * min(1.0, TITLE_LETTERS / len(title)))
         success = results.summary(row, "success")
         axes.set_title(f"{success.value:.2f}" if success else "", loc="right", fontweight="normal")
     handles = [
@@ -106,8 +103,7 @@ def trajectories(results: Results, scene: Scene) -> Figure | None:
     ]
     if maze:
         handles.append(Line2D([], [], marker="*", ls="", ms=11, mfc="#FFD23F", mec=INK, mew=0.8, label="goal"))
-    ncols = 4 if columns > 2 else 2
-    figure.legend(handles=handles, loc="outside lower center", ncols=ncols, columnspacing=1.6)
+    figure.legend(handles=handles, loc="outside lower center", ncols=4 if columns > 2 else 2, columnspacing=1.6)
     return figure
 
 

@@ -89,10 +89,7 @@ def draw_band(axes: Axes, at: Floats, mean: Floats, low: Floats, high: Floats, *
 
 def score_axis(axes: Axes, score: "Score") -> None:
     """Start the vertical axis at a score of zero, and end it at the limit if there is one."""
-    if score.limit is None:
-        axes.set_ylim(bottom=0)
-    else:
-        axes.set_ylim(-0.02 * score.limit, 1.02 * score.limit)
+    axes.set_ylim(*((0, None) if score.limit is None else (-0.02 * score.limit, 1.02 * score.limit)))
 
 
 def png(figure: Figure) -> bytes:
