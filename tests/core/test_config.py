@@ -106,6 +106,14 @@ def test_a_fault_names_its_key_and_what_was_expected(tmp_path: Path, text: str, 
     assert expected in fault(tmp_path, task + text)
 
 
+def test_what_is_wrong_with_a_value_is_said_in_a_sentence_that_goes_on(tmp_path: Path) -> None:
+    class Named(Config):
+        name: str = Field(min_length=2)
+
+    with pytest.raises(RecipeError, match=r"recipe\.toml: name: string should have at least 2 characters"):
+        load_recipe(write(tmp_path, 'name = "a"'), Named)
+
+
 def test_a_syntax_error_names_its_line(tmp_path: Path) -> None:
     assert fault(tmp_path, 'task = "maze"\nseeds = [1,\nx').startswith("FILE, line 3: not valid TOML: ")
     assert fault(tmp_path, "task =").startswith("FILE, line 1: not valid TOML: ")

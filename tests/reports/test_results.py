@@ -10,11 +10,13 @@ from astra_data.reports.results import (
     DatasetUse,
     Errors,
     Line,
+    Origin,
     Results,
     TrainingFacts,
     elapsed_seconds,
     judged_horizon,
     merge,
+    merged_origins,
     read_results,
     replaced,
     results_json,
@@ -37,6 +39,14 @@ def error(row: str, seed: int, simulator: str, *mean: float, horizons: tuple[int
     return Errors(
         row=row, seed=seed, simulator=simulator, quantity="x_m", horizons=[*horizons], mean=[*mean], low=low, high=high
     )
+
+
+def test_code_and_machine_stand_once_with_all_stages_that_ran_there() -> None:
+    def origin(commit: str, *stages: str) -> Origin:
+        return Origin(commit=commit, machine=None, packages={}, stages=[*stages])
+
+    found = merged_origins([origin("a", "pair"), origin("b", "train"), origin("a", "train", "pair")])
+    assert [(one.commit, one.stages) for one in found] == [("a", ["pair", "train"]), ("b", ["train"])]
 
 
 def test_numbers_are_found_by_method_place_and_size() -> None:
