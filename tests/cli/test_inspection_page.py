@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from astra_data.cli.inspection_page import inspection_page
+from astra_data.cli.inspection_page import inspection_page, shaded
 from astra_data.dataset.checkup import Checkup, Finding
 from astra_data.dataset.columns import Column
 from astra_data.dataset.inspection import BINS, Endings, Inspection, Map, Spread
@@ -61,3 +61,8 @@ def test_a_page_sums_up_the_dataset(success: int | None) -> None:
     assert table[3] == "positions, x -1.0 to 0.0 m, y 2.0 to 3.0 m" and table[4] == "█"
     assert table[5:8] == ["check-up", "endings: 3 cut", "rate: 20 Hz declared"]
     assert table[8:] == ["nothing looks wrong in the values; `astra-data validate` also checks all files"]
+
+
+def test_a_map_begins_at_its_top_and_is_dark_where_the_robot_often_was() -> None:
+    counts = np.array([[0, 0], [0, 4], [1, 0]])  # from below, two in a line
+    assert shaded(Map(counts, np.zeros(2), 0.5)) == "▒\n █"
