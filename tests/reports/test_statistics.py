@@ -96,14 +96,23 @@ def test_equal_shares_have_an_interval_as_wide_as_drawing_their_episodes() -> No
     equal = summarize([1.0] * 3, limit=1.0, trials=EPISODES)
     assert equal.low == pytest.approx(1 / (1 + quantile**2 / 360)) and equal.high == 1.0
     found = paired_difference(dict.fromkeys(range(3), 0.6), dict.fromkeys(range(3), 0.5), trials=EPISODES)
-    assert found and found.low is not None and found.low < 0.05
+    # With two successes and two failures more, of 360 episodes a side.
+    near = np.array([216 + 2, 180 + 2]) / 364
+    assert found and found.low == pytest.approx(0.1 - quantile * np.sqrt((near * (1 - near)).sum() / 360))
+    # A variance of 0.01 / 3, or 0.04 / 9 with one seed more, is that of 0.09 * 9 / 0.04 episodes.
+    extra = quantile**2 / 20.25
+    wilson = (0.9 + extra / 2 - np.sqrt(0.09 * extra + extra**2 / 4)) / (1 + extra)
+    assert summarize([0.8, 0.9, 1.0], limit=1.0, trials=EPISODES).low == pytest.approx(wilson)
 
 
 def test_a_difference_is_that_of_a_paired_t_test_on_the_seeds_that_both_have() -> None:
     rng = np.random.default_rng(0)
     seeds = rng.normal(0, 1, 7)
     ours, theirs = seeds + rng.normal(0.3, 0.1, 7), seeds + rng.normal(0, 0.1, 7)
+    ours, theirs = ours / 9 + 0.5, theirs / 9 + 0.5
     found = paired_difference(dict(enumerate(ours)) | {9: 5.0}, dict(enumerate(theirs)))
+    # Drawing episodes scatters less.
+    assert found == paired_difference(dict(enumerate(ours)), dict(enumerate(theirs)), trials=10**6)
     expected = stats.ttest_rel(ours, theirs).confidence_interval(0.95)
     assert found is not None
     assert [found.value, found.low, found.high] == pytest.approx([(ours - theirs).mean(), expected.low, expected.high])

@@ -67,7 +67,8 @@ def test_a_method_that_did_not_learn_its_own_simulator_is_the_reason_to_deploy_n
     assert "-2.70" not in words(learned) and "`total_steps` of `[train]`" in words(learned)
 
 
-def test_what_is_lost_on_the_way_is_the_reason_where_all_learned_their_simulators() -> None:
+@pytest.mark.parametrize(("raw", "is_worse"), [(1.0, True), (2.0, True), (2.1, False)])
+def test_what_is_lost_on_the_way_is_the_reason_where_all_learned_their_simulators(raw: float, is_worse: bool) -> None:
     errors = [
         Errors(
             row="astra",
@@ -79,12 +80,12 @@ def test_what_is_lost_on_the_way_is_the_reason_where_all_learned_their_simulator
             low=[0.1, mean],
             high=[0.1, mean],
         )
-        for simulator, mean in (("raw", 1.0), ("grounded", 2.0))
+        for simulator, mean in (("raw", raw), ("grounded", 2.0))
     ]
     of = FLOOR | {"astra": (0.3,) * 3}
     found = verdict_of(results(of, {"astra": GOOD}, errors=errors))
     assert found.row is None and "ASTRA, has success 0.30" in found.text
-    assert "correction is no better than none in `x_m`" in words(found)
+    assert ("correction is no better than none in `x_m`" in words(found)) == is_worse
 
 
 @pytest.mark.parametrize(
@@ -100,6 +101,7 @@ def test_what_is_lost_on_the_way_is_the_reason_where_all_learned_their_simulator
 def test_the_rule_at_its_edges(floor: float, astra: float, row: str | None) -> None:
     found = verdict_of(results({"direct_transfer": (floor,) * 3, "astra": (astra,) * 3}))
     assert found.row == row
+    assert ("do not show a difference" in dict(found.lines)["interval"]) == (abs(floor - astra) < 0.2)
 
 
 @pytest.mark.parametrize("best", ["astra", "direct_transfer"])
@@ -109,6 +111,7 @@ def test_what_fails_in_a_third_of_its_episodes_is_not_deployed_however_often_it_
     assert found.row is None
     assert "Deploy none yet" in found.text and "fails in 34 % of its episodes" in found.text
     assert verdict_of(results(target | {best: (0.66,) * 3}, failing=0.95)).row == best
+    assert verdict_of(results({"astra": (0.5,) * 3}, failing=2 / 3)).row is None  # a third
 
 
 def test_references_alone_are_nothing_to_deploy() -> None:

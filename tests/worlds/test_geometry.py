@@ -81,6 +81,9 @@ def test_values_keep_their_type_and_lone_headings_their_shape() -> None:
     moved = PlanarMap(rotation_rad=np.pi).of_column(yaw, np.array([0.5, -0.5], np.float32))
     assert moved.dtype == np.float32 and moved.shape == (2,)
     np.testing.assert_allclose(moved, [0.5 - np.pi, np.pi - 0.5], rtol=1e-6)
+    both = Column("both", size=4, astra={"role": ["position", "position", "vector", "vector"]})
+    moved = PlanarMap(np.pi / 2, (1.0, 2.0)).of_column(both, np.array([[3.0, 4.0, 3.0, 4.0]]))
+    np.testing.assert_allclose(moved, [[1.0 - 4.0, 2.0 + 3.0, -4.0, 3.0]])
 
 
 def test_a_column_without_roles_is_refused() -> None:

@@ -146,3 +146,5 @@ def test_heights_outside_of_the_range_end_an_episode(height: float, failed: bool
     env.reset(step.terminated)
     assert not env.failed.any()
     assert step.terminated.tolist() == [failed, False]  # what was handed out stays
+    assert env.step(torch.zeros(2, 4), torch.tensor([True, False])).reward[1] == 0.0
+    assert env.locomotion.healthy(np.array([1.0, 1.01, 1.99, 2.0])).tolist() == [False, True, True, False]

@@ -81,6 +81,10 @@ def test_pay_and_falls_are_the_targets_but_for_costs(
 
 def test_the_walkers_mass_moves_as_mujoco_says() -> None:
     objective, model = tasks.PlanarWalking(horizon=5), walker_model()
+    heights = torch.tensor([[1.0], [1.01], [1.99], [2.0]])
+    assert objective.missed(heights, NOTHING).tolist() == [True, False, False, True]
+    masses = torch.tensor([[0.0] * 36 + [mass_m] + [0.0] * 9 for mass_m in (0.64, 0.65)])
+    assert made(tasks.MassWalking).missed(masses, NOTHING).tolist() == [True, False]
     data = mujoco.MjData(model)
     generator = np.random.default_rng(0)
     data.qpos[1:], data.qvel[:] = [1.4, 0.3, -0.4, -1.0, 0.2, -0.5], generator.normal(size=7)

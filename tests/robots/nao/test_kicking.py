@@ -29,6 +29,7 @@ def test_a_body_knocks_its_ball_away_along_the_line_between_them() -> None:
     assert place[0].tolist() == pytest.approx([0.1 + 0.19 * diagonal, 0.19 * diagonal], abs=1e-6)
     beside, turned = kicking.knock(before, after, ball, torch.zeros(1, 2), kicking.Contact(0.19, 0.7, torch.pi / 4))
     # It begins where the body touches it, whichever way it leaves.
+    assert torch.equal(kicking.knock(after, after, ball, ball, kicking.Contact(0.19, 0.7))[0], ball)  # it stands
     assert torch.equal(beside, place) and turned[0].tolist() == pytest.approx([0.0, 0.7], abs=1e-6)
 
 
@@ -83,6 +84,10 @@ def test_it_stands_and_kicks() -> None:
     assert state[0].tolist() == pytest.approx([0, 0, 0, 0, 0.22 + way, 0, 1.5 - 0.3 * 0.2, 0], abs=1e-5)
     # Out of reach.
     assert state[1].tolist() == pytest.approx([0, 0, 0, 0, 0.32, 0, 0, 0], abs=1e-5)
+    turned = VariedPlanar(one(), BallVariation(contact_direction_deg=(90.0, 90.0)))
+    turned.reset_to(START)
+    state = turned.step(torch.tensor([[0.0, 0.0, 1.0]]))
+    assert state[0, 4:].tolist() == pytest.approx([0.22, way, 0, 1.5 - 0.3 * 0.2], abs=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -204,6 +209,9 @@ def test_starts_are_where_the_task_says() -> None:
     assert ball.max(axis=0) == pytest.approx([0.0, 0.6], abs=0.01) and (np.abs(robot) <= 1.9).all()
     apart = np.linalg.norm(robot - ball, axis=1)
     assert apart.min() >= 0.4 - 1e-9 and apart.max() <= 1.0 + 1e-9
+    near = TASK.draw_anywhere(np.random.default_rng(0), 4000)
+    near_m = np.linalg.norm(near[:, :2] - near[:, 4:6], axis=1)
+    assert [near_m.min(), near_m.max()] == pytest.approx([0.18, 0.5], abs=0.01)
     # All around the ball.
     to_goal = np.array([1.5, 0.0]) - ball
     ahead = ((robot - ball) * to_goal).sum(axis=1) > 0

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from nao_values import NO_ERRORS
@@ -27,6 +29,16 @@ def test_without_errors_beliefs_are_true() -> None:
         np.testing.assert_allclose(np.cos(place.pose[:, 2] - pose[:, 2]), 1.0, atol=1e-12)
         np.testing.assert_allclose(sight.position, ball, atol=1e-9)
         np.testing.assert_allclose(sight.velocity, np.tile([0.1, -0.05], (5, 1)) / STEP_S, atol=1e-9)
+
+
+def test_estimates_are_as_old_as_told_and_the_ball_is_where_it_seems_from_there() -> None:
+    rng = np.random.default_rng(0)
+    place, sight = Localisation(1, replace(NO_ERRORS, latency_s=STEP_S / 2), STEP_S), BallSight(1, NO_ERRORS, STEP_S)
+    place.reset(np.arange(1), np.array([[0.0, 0.0, 3.1]]), rng)
+    place.update(np.array([[0.2, 0.4, -3.0]]), rng, everyone(1))
+    assert place.pose[0].tolist() == pytest.approx([0.1, 0.2, -3.0 - (2 * np.pi - 6.1) / 2])
+    sight.update(np.array([[1.0, 0.0]]), np.zeros((1, 3)), np.array([[1.0, 2.0, np.pi / 2]]), rng, everyone(1))
+    assert sight.position[0].tolist() == pytest.approx([1.0, 3.0])
 
 
 def test_errors_are_as_large_as_told() -> None:

@@ -96,6 +96,8 @@ def strides(command: Floats, seconds: float, gait: walk.Gait | None = None) -> l
 )
 def test_attainable_speeds(command: tuple[float, ...], attained: tuple[float, ...]) -> None:
     np.testing.assert_allclose(planner(1.0).attainable(one(*command)), [attained], atol=1e-12)
+    worn = planner(0.5).attainable(np.array([[0.9, 0, 0], [0, -0.9, 0], [0, 0, -9.0]]))
+    np.testing.assert_allclose(worn, np.diag([0.125, -0.1, -np.radians(60)]), atol=1e-12)
 
 
 def test_forward_speed_is_gained_slowly_and_lost_fast() -> None:
@@ -104,6 +106,8 @@ def test_forward_speed_is_gained_slowly_and_lost_fast() -> None:
     walking = strides(one(0.25, 0, 0), 2.0)[-1]
     back = [float(gait.forward_m_s[0]) for gait in strides(one(-0.15, 0, 0), 1.0, walking)]
     np.testing.assert_allclose(back[:3], [-0.05, -0.125, -0.15])
+    slow = strides(one(0.15, 0, 0), 2.0)[-1]  # beyond zero it is a gain
+    assert strides(one(-0.15, 0, 0), 1.0, slow)[0].forward_m_s[0] == pytest.approx(-0.075)
 
 
 def test_the_leading_foot_goes_aside_and_the_other_follows() -> None:
@@ -182,6 +186,12 @@ def test_the_torso_sways_as_a_pendulum_on_the_supporting_foot() -> None:
     assert sway.min() > -0.05 and sway.max() < 0
     acceleration = (sway[0] - 2 * sway[1] + sway[2]) / dt**2
     np.testing.assert_allclose(acceleration, rate**2 * (sway[1] + STYLE.sway_foot_m), rtol=1e-3)
+    # In steps aside that foot moves evenly, by half a step to either end.
+    aside = {"before": [0.0, 0.02, 0.0], "after": [0.0, 0.03, 0.0]}
+    sway = np.array([[engine()._sway(striding(phase=phase, **aside))[0] for phase in row] for row in phases])
+    foot = -STYLE.sway_foot_m + 0.01 * (1 - phases[1]) - 0.015 * phases[1]
+    acceleration = (sway[0] - 2 * sway[1] + sway[2]) / dt**2
+    np.testing.assert_allclose(acceleration, rate**2 * (sway[1] - foot), rtol=1e-3)
 
 
 def test_targets_are_the_angles_of_the_planned_feet_tick_by_tick() -> None:
@@ -205,7 +215,7 @@ def test_a_kick_waits_for_the_foot_that_is_asked_for_and_keeps_the_robot_steppin
     for asked, swings_left in (([True, False], True), ([False, True], False)):
         gait = walk.Gait.standing(1, LIMITS)
         targets = engine().advance(gait, np.zeros((1, 3)), 120, np.array([asked]))
-        kicking = [bool(gait.left_swings[0]) for gait in targets.gaits if gait.kicking[0]]
-        assert kicking and set(kicking) == {swings_left}
+        kicking = {(bool(gait.left_swings[0]), int(gait.kind[0])) for gait in targets.gaits if gait.kicking[0]}
+        assert kicking == {(swings_left, walk.STRIDE)}
     still = engine().advance(walk.Gait.standing(1, LIMITS), np.zeros((1, 3)), 120, np.array([[False, False]]))
     assert not any(gait.walking[0] for gait in still.gaits)

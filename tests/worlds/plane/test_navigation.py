@@ -142,3 +142,4 @@ def test_walls_end_an_episode_where_the_objective_says_so(objective: Navigation,
     step = judged(target, [[0.5, 0.0]] * 3)
     assert target.failed.tolist() == step.terminated.tolist() == failed
     torch.testing.assert_close(step.reward, 0.5 - 10.0 * torch.tensor(failed).float())
+    assert judged(target, [[0.9, 0.0]] * 3).success.all() and not target.failed.any()  # at the goal, by a wall

@@ -67,18 +67,23 @@ def test_corrections_keep_as_clear_of_walls_as_they_are_told_and_steps_do_not() 
     settled = states.settle(start, landed)
     torch.testing.assert_close(settled[:, 1], torch.tensor([5.5, 5.3, 5.4]), atol=1e-3, rtol=0)
     torch.testing.assert_close(settled[:, 0], torch.tensor([-4.0, -4.0, -3.5]))
+    # Who is stopped is as fast as it came on in the 0.1 s.
+    torch.testing.assert_close(settled[:, 3], torch.tensor([1.0, 0.0, 0.0]), atol=1e-2, rtol=0)
     assert states.blocked.tolist() == [True, False, False]
     moved, stopped = states.free.slide(start[:, :2], landed[:, :2])
     torch.testing.assert_close(moved, landed[:, :2])
     assert not stopped.any()
+    states.keep_clear(0.0)  # its radius is as close as it comes
+    assert float(states.settle(start, start + torch.tensor([0.0, 0.58, 0.0, 0.0, 0.0]))[:, 1].max()) < 5.901
 
 
 def test_corrections_slide_along_walls_and_keep_all_else() -> None:
     states = planar(3, 5)
     landed = HERE.clone()
     landed[0, 1], landed[1, 0], landed[:, 2:] = 5.95, -3.95, 0.5
+    states.blocked[2] = True  # in the step before
     settled = states.settle(HERE, landed)
-    assert states.blocked.tolist() == [True, False, False]
+    assert states.blocked.tolist() == [True, False, True]
     # The wall's face is at 6 m, the disc's center stays 0.1 m away.
     assert 5.8 < settled[0, 1] < 5.9001 and torch.equal(settled[1:], landed[1:])
     assert torch.equal(settled[:, 2:], landed[:, 2:]) and settled is states.state

@@ -47,6 +47,12 @@ def test_only_what_keeps_its_distance_may_move() -> None:
     (first, second) = relocation().stretches(path)
     assert (first[0], second[1]) == (0, 100) and abs(first[1] - 37) <= 1 and abs(second[0] - 63) <= 1
     assert relocation(min_steps=40).stretches(path) == [] and relocation(margin_m=0.3).stretches(path) == [(0, 100)]
+    assert relocation(min_steps=100, margin_m=0.3).stretches(path) == [(0, 100)]
+    # Drawn in proportion to their lengths.
+    short = Episode(0, {name: values[25:] for name, values in path.columns.items()})
+    placed = relocation(rotations="none", translations=False, tries=400).placements(short, np.random.default_rng(0))
+    firsts = [steps.start for _, steps in placed]
+    assert len(firsts) == 400 and firsts.count(0) / 400 == pytest.approx(12 / 49, abs=0.07)
 
 
 def draws(count: int, episode: Episode, **changes: Any) -> list[Any]:
@@ -83,7 +89,7 @@ def test_what_fits_nowhere_is_given_up() -> None:
     assert list(relocation(tries=5).placements(long, np.random.default_rng(0))) == []
 
 
-@pytest.mark.parametrize(("toppled_at", "length", "success"), [(None, 16, True), (9, 10, False)])
+@pytest.mark.parametrize(("toppled_at", "length", "success"), [(None, 16, True), (9, 10, False), (15, 16, True)])
 def test_an_episode_ends_at_the_goal_or_where_it_topples(toppled_at: int | None, length: int, success: bool) -> None:
     # 0.1 m per step along the lower corridor; within 0.45 m of the goal from step 15 on.
     path = straight((AIM[0] + 2.0, AIM[1]), (AIM[0] - 1.0, AIM[1]), 30)
