@@ -168,13 +168,15 @@ def show_made(folder: Path, until: str | None) -> None:
     from astra_data.pipeline.plan import stages_until
     from astra_data.pipeline.run import POINTS
     from astra_data.pipeline.stages.report import HTML, JSON
+    from astra_data.reports.diagnosis import DIAGNOSIS
     from astra_data.reports.held_out import PAGE
     from astra_data.reports.results import read_results
     from astra_data.reports.verdict import verdict_of
 
     made = stages_until(until)
-    if until == "ground" and (folder / PAGE).is_file():
-        typer.echo((folder / PAGE).read_text())
+    pages = {"pair": folder / DIAGNOSIS, "ground": folder / PAGE}
+    if until in pages and pages[until].is_file():
+        typer.echo(pages[until].read_text())
     typer.echo(f"finished: {folder}")
     found = folder / "report" / JSON
     verdict = verdict_of(read_results(found)) if "report" in made and found.is_file() else None
@@ -182,7 +184,7 @@ def show_made(folder: Path, until: str | None) -> None:
         shown = [f"{label:8}  {text}" for label, text in verdict.lines]
         remarks = verdict.remarks if verdict.row is None else []
         typer.echo("\n  ".join([verdict.text.replace("**", ""), *shown, *remarks]))
-    pages = {"ground": folder / PAGE, "report": folder / "report" / HTML, "evaluate": folder / POINTS}
+    pages |= {"report": folder / "report" / HTML, "evaluate": folder / POINTS}
     for file in (page for stage, page in pages.items() if stage in made):
         if file.is_file():
             typer.echo(str(file))

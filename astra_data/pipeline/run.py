@@ -15,7 +15,8 @@ from rich.console import Console
 from astra_data.core.config import did_you_mean
 from astra_data.core.durable import alone_in, clean, folder_for, make_folder, move, write_file
 from astra_data.core.errors import BadInputError, MissingStageError, optional
-from astra_data.core.naming import RECORD, RUNS, reference_of, row_of_key, stage_of_key
+from astra_data.core.naming import RECORD, RUNS, artifact_key, reference_of, row_of_key, stage_of_key
+from astra_data.grounding.diagnosis import diagnose
 from astra_data.methods import grounded_as, method_named
 from astra_data.pipeline.display import display
 from astra_data.pipeline.executors import EXECUTORS, Item
@@ -34,6 +35,7 @@ from astra_data.pipeline.stages.registry import STAGES
 from astra_data.pipeline.stages.report import is_current
 from astra_data.pipeline.user_code import UserMethod, add_all, digests_of, record_code
 from astra_data.reports.artifacts import CURVE, EVALUATION, METRICS, Artifact, Evaluation, read_json
+from astra_data.reports.diagnosis import DIAGNOSIS, diagnosis_page
 from astra_data.reports.held_out import write_held_out
 from astra_data.robots.registry import TASKS, task_named
 from astra_data.worlds.walk_through import check_task
@@ -68,7 +70,7 @@ def run(
     Of its rows, seeds and sizes, those given are made, by default all, up to the stage `until`. There are `jobs`
     items at a time, by default one per core, or two on a CUDA device, run by an `engine` in `EXECUTORS`, Ray's at an
     `address`. Each finished point is logged to a project of `trackio`, if one is given. Where it grounds, the page
-    of held-out errors is written, too.
+    of held-out errors is written, too; where it ends with that or with the pairs, what they say before any fit.
 
     Raises:
         RecipeError: the recipe has faults, or differs from the one that made the existing artifacts.
@@ -96,6 +98,8 @@ def run(
     make(experiment, items, planned, jobs=jobs, device=device, engine=engine, address=address, table=table)
     if "ground" in wanted:
         write_errors(experiment, part)
+    if until in ("pair", "ground"):
+        write_diagnosis(experiment, part)
     return experiment.folder
 
 
@@ -110,6 +114,14 @@ def write_errors(experiment: Experiment, part: Selection) -> Path | None:
         part.percents,
         timestep_s=task_named(experiment.recipe.task).timestep_s,
     )
+
+
+def write_diagnosis(experiment: Experiment, part: Selection) -> None:
+    """Write the page of what the paired episodes of the first seed say before any fit, if there are any."""
+    recipe, paired = experiment.recipe, experiment.folder / artifact_key("pair", "", part.seeds[0])
+    if paired.is_dir():
+        page = diagnosis_page(experiment.path.stem, diagnose(paired, recipe.task), task_named(recipe.task).timestep_s)
+        write_file(experiment.folder / DIAGNOSIS, page)
 
 
 def run_stage(

@@ -1,0 +1,68 @@
+"""The page of what paired episodes say before any fit."""
+
+import numpy as np
+
+from astra_data.core.arrays import Floats
+from astra_data.grounding.diagnosis import Diagnosis
+from astra_data.reports.blocks import Section, TableBlock, Text, code, markdown
+
+DIAGNOSIS = "diagnosis.md"
+_BARS = " ▁▂▃▄▅▆▇█"
+
+
+def diagnosis_page(recipe: str, found: Diagnosis, timestep_s: float) -> str:
+    """Return the page of a diagnosis in Markdown."""
+    findings = [f"**{one.what}**: {one.advice}." for one in found.findings]
+    delays = [
+        [one.name, _with_ends(one.delay_s) if one.is_visible else "-", _with_ends(one.gain), _bars(one.weights)]
+        for one in found.responses
+    ]
+    missed = [
+        [one.name, one.unit or "1", f"{one.error:.3g}", f"{one.still:.3g}", one.where or "everywhere alike"]
+        for one in found.missed
+    ]
+    about = Text(f"What {code(found.reference)} and the abstract simulator say before anything is fitted.")
+    shape = f"response by step of {timestep_s:g} s"
+    meaning = Text(
+        "The robot's motion as a sum of what the simulator does for the present and the past commands: effect is the "
+        "sum of their shares (1: as much as in the simulator), delay their mean lag, dead time and time constant "
+        f"together. Intervals are a bootstrap over recordings. With commands shifted by {found.best_shift} steps, the "
+        "simulator's one-step error is least."
+    )
+    delay_table = TableBlock("", ["command", "delay (s) [95 %]", "effect [95 %]", shape], delays)
+    missed_table = TableBlock("", ["value", "unit", "error (RMS)", "persistence baseline", "where"], missed, words=2)
+    sections = [
+        Section("", [about, Text("" if findings else "Nothing that needs attention.", findings)]),
+        Section("Delay of each command", [delay_table, meaning]),
+        Section("What the simulator misses, one step ahead", [missed_table]),
+    ]
+    if found.explained:
+        lines = [[name, f"{value:.2f}"] for name, value in found.explained.items()]
+        text = "Ridge regression on held-out recordings (R²; 0: nothing, 1: all of it)."
+        sections.append(Section("What explains that error", [TableBlock("", ["from", "explained"], lines), Text(text)]))
+    if found.forecast:
+        sizes, left = found.forecast.sizes, found.forecast.left
+        lines = [
+            [f"{size}", *(f"{value:.2f}" for value in np.percentile(of, [50, 2.5, 97.5]))]
+            for size, of in zip(sizes, left, strict=True)
+        ]
+        lines.append([f"{found.forecast.more} (forecast)", *(f"{value:.2f}" for value in found.forecast.expected)])
+        text = (
+            "Share of the simulator's squared error that a ridge regression on histories leaves on held-out "
+            "recordings, refitted to random ones; a grounding leaves less, and what it leaves falls alike."
+        )
+        table = TableBlock("", ["recordings", "left", "2.5 %", "97.5 %"], lines)
+        sections.append(Section("Enough recordings?", [table, Text(text)]))
+    return markdown(f"{recipe}: before any fit", sections)
+
+
+def _with_ends(values: tuple[float, float, float]) -> str:
+    value, low, high = values
+    return f"{value:.2f} [{low:.2f}, {high:.2f}]"
+
+
+def _bars(weights: Floats) -> str:
+    """Draw the shares of a response by lag, without the last that are empty."""
+    most = max(float(weights.max()), 1e-12)
+    levels = [round(max(float(weight), 0.0) / most * (len(_BARS) - 1)) for weight in weights]
+    return "".join(_BARS[level] for level in levels).rstrip()

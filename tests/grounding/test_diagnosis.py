@@ -1,0 +1,115 @@
+"""A robot that follows its commands late, in what is known of it."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from astra_data.core.errors import BadInputError
+from astra_data.dataset.columns import ACTION, NEXT_STATE, OUTCOME_COLUMNS, STATE, SUCCESS, TERMINATED, Column, Episode
+from astra_data.dataset.writer import DatasetWriter
+from astra_data.grounding.diagnosis import Diagnosis, diagnose
+from astra_data.pipeline.stages.pair import pair
+from astra_data.reports.diagnosis import diagnosis_page
+
+SIMULATOR = '''
+import torch
+from astra_data import Column
+
+class Axes:
+    """Two carts on rails that move at once as they are told, [x, y]."""
+    abstract_state = Column("abstract.state", size=2, names=("x", "y"), astra={"unit": ["m", "m"]})
+    parameters = {"timestep_s": 0.1}
+    def __init__(self, num_envs):
+        self.state = torch.zeros(num_envs, 2)
+    @staticmethod
+    def abstraction(state):
+        return state[:, :2]
+    def reset_to(self, state, rows=None):
+        self.state = state.clone() if rows is None else self.state.index_copy(0, rows, state)
+    def step(self, action):
+        self.state = self.state + 0.1 * action
+        return self.state
+'''
+
+
+def recorded(
+    folder: Path, dead: tuple[int, int] = (0, 0), lag_s: float = 0.0, *, fails: int = 0, same: bool = False
+) -> Diagnosis:
+    """Return the diagnosis of 12 recordings of 150 steps, in which commands act `dead` steps late and with a lag."""
+    (folder / "axes.py").write_text(SIMULATOR)
+    rng, follows = np.random.default_rng(0), 1.0 if not lag_s else 1 - np.exp(-0.1 / lag_s)
+    columns = [Column(STATE, size=4, names=("x", "y", "vx", "vy")), Column(NEXT_STATE, size=4)]
+    columns += [Column(ACTION, size=2, names=("pull", "push"))]
+    columns += [column for column in OUTCOME_COLUMNS if column.name in (TERMINATED, SUCCESS)]
+    about = {"name": "logs", "stage": "import"}
+    with DatasetWriter(folder / "logs", columns, fps=10, task="rail", description=about) as writer:
+        for number in range(12):
+            command = rng.uniform(-1.0, 1.0, (170, 2)).repeat(rng.integers(1, 6, 170), axis=0)[:170]
+            if same:
+                command[:, 1] = command[:, 0]
+            state = np.zeros((151, 4))
+            for step in range(150):
+                told = [command[10 + step - dead[axis], axis] for axis in (0, 1)]
+                velocity = state[step, 2:] + follows * (np.array(told) * [0.9, 0.5] - state[step, 2:])
+                state[step + 1] = [*(state[step, :2] + 0.1 * velocity), *velocity]
+            ended = np.zeros(150, bool)
+            ended[-1] = number < fails
+            values = {STATE: state[:-1], NEXT_STATE: state[1:], ACTION: command[10:160]}
+            values |= {TERMINATED: ended, SUCCESS: np.zeros(150, bool)}
+            kinds = {column.name: column.dtype for column in columns}
+            writer.add(Episode(number, {name: each.astype(kinds[name]) for name, each in values.items()}, {}))
+    simulator = f"{folder / 'axes.py'}:Axes"
+    return diagnose(pair(simulator, dataset=folder / "logs", out=folder / "pairs"), simulator)
+
+
+@pytest.mark.parametrize("dead", [(0, 5), (1, 3), (2, 4)])
+def test_dead_times_and_gains_are_found_for_each_command(tmp_path: Path, dead: tuple[int, int]) -> None:
+    found = recorded(tmp_path, dead)
+    assert [one.name for one in found.responses] == ["pull", "push"]
+    for one, steps, gain in zip(found.responses, dead, (0.9, 0.5), strict=True):
+        value, low, high = one.delay_s
+        assert value == pytest.approx(0.1 * steps, abs=0.01) and low <= value <= high < low + 0.05
+        assert one.gain[0] == pytest.approx(gain, abs=0.02)
+    late = {line.what.split()[0] for line in found.findings if "later than in the simulator" in line.what}
+    assert late == {name for name, steps in zip(("pull", "push"), dead, strict=True) if steps}
+    assert min(dead) <= found.best_shift <= max(dead)
+
+
+def test_a_time_constant_is_a_delay_and_is_hidden_state(tmp_path: Path) -> None:
+    found = recorded(tmp_path, lag_s=0.3, fails=12)
+    # The mean lag of a first-order lag that is sampled each 0.1 s.
+    assert found.responses[0].delay_s[0] == pytest.approx(0.1 / (np.exp(0.1 / 0.3) - 1), abs=0.02)
+    present, history, recorded_state = found.explained.values()
+    assert present < history - 0.1 and recorded_state > 0.99 and history > 0.95
+    assert any("train `astra`" in line.advice for line in found.findings)
+    assert not any("failure" in line.what for line in found.findings)
+
+
+def test_what_one_parameter_would_mend_is_not_hidden_state(tmp_path: Path) -> None:
+    found = recorded(tmp_path, fails=3)
+    assert found.explained["the present abstract state and command"] > 0.99
+    assert any("nothing hidden shows" in line.advice for line in found.findings)
+    assert any(line.what == "3 episodes end in a failure" for line in found.findings)
+    x, y = found.missed
+    # y lags half of 0.1 m/s² behind, x a tenth; a command of ±1 has an RMS of 1/√3.
+    assert y.error == pytest.approx(0.05 / np.sqrt(3), rel=0.1) and x.error == pytest.approx(0.01 / np.sqrt(3), rel=0.1)
+    assert y.still == pytest.approx(y.error, rel=0.01) and " times as large where " in y.where
+
+
+def test_commands_that_only_vary_together_are_warned_of(tmp_path: Path) -> None:
+    assert any(line.what == "pull and push only ever vary together" for line in recorded(tmp_path, same=True).findings)
+
+
+def test_the_page_shows_all_of_it(tmp_path: Path) -> None:
+    text = diagnosis_page("rail", recorded(tmp_path, (0, 2)), 0.1)
+    assert re.search(r"\| push \| 0\.2\d \[0\.\d\d, 0\.\d\d\] \| 0\.\d\d \[0\.\d\d, 0\.\d\d\] \|   █ \|", text)
+    assert "- **push acts 0.2" in text and "| a history of 8 steps | 1.00 |" in text
+    assert re.search(r"\| y \| m \| 0\.0\d+ \|", text)
+
+
+def test_a_dataset_that_is_not_paired_is_refused(tmp_path: Path) -> None:
+    recorded(tmp_path)
+    with pytest.raises(BadInputError, match=r"no column abstract.state: expected a dataset that was paired"):
+        diagnose(tmp_path / "logs", f"{tmp_path / 'axes.py'}:Axes")
