@@ -74,8 +74,8 @@ class _Index:
         earlier = (later - 1).clip(min=0)
         nearest = np.where(wanted - self.shown[earlier] < self.shown[later] - wanted, earlier, later)
         apart_s = np.abs(self.shown[nearest] - wanted) * float(self.time_base)
-        if (wrong := apart_s > clip.step / 2 + 1e-9).any() or len(np.unique(nearest)) < clip.count:
-            time_s = wanted_s[wrong.argmax() if wrong.any() else -1]
+        if (wrong := apart_s > clip.step / 2 + 1e-9).any():
+            time_s = wanted_s[wrong.argmax()]
             raise CorruptDatasetError(f"{clip.path} has no frame at {time_s:.3f} s, expected {clip.count} in a row")
         return np.asarray(self.shown[nearest])
 

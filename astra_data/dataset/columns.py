@@ -181,7 +181,7 @@ class Clip:
 
     def part(self, first: int, end: int, every: int = 1) -> "Clip":
         """Return the pictures `first` to `end`, exclusive, each `every`-th."""
-        count = -(-(end - first) // every)
+        count = (end - first) // every
         return replace(self, start=self.start + first * self.step, step=self.step * every, count=count)
 
 
