@@ -1,4 +1,5 @@
 import io
+import re
 import shutil
 from collections.abc import Sequence
 from dataclasses import replace
@@ -24,6 +25,7 @@ from astra_data.dataset.frames import Frames
 from astra_data.dataset.inspection import inspect_dataset
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.timing import resample, trim
+from astra_data.dataset.versions import next_version
 from astra_data.io.hub.card import Notes, render_card
 from astra_data.io.hub.stores import dataset_files
 
@@ -41,7 +43,9 @@ STATISTICS = {key: [[[0.5]], [[0.25]], [[0.125]]] for key in ("min", "max", "mea
 def film(path: Path, frames: int, codec: str = "libx264", **options: str) -> Path:
     """Write a video of which every frame is another."""
     with av.open(str(path), "w") as file:
-        stream = file.add_stream(codec, rate=FPS, options={"g": "2", **options})
+        stream = file.add_stream(
+            codec, rate=FPS, options={"g": "2", "sc_threshold": "0", "x265-params": "scenecut=0", **options}
+        )
         stream.width, stream.height, stream.pix_fmt = 64, 64, "yuv420p"
         for number in range(frames):
             picture = np.full((64, 64, 3), 40 + number, np.uint8)
@@ -64,7 +68,10 @@ def stills(path: Path, frames: int) -> Path:
 
 @pytest.fixture(scope="module")
 def source(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    """Three episodes with two cameras; the first frame of the files belongs to none."""
+    """Three episodes with two cameras, a file each; the first frame of what they were made from belongs to none."""
+    patch = pytest.MonkeyPatch()
+    patch.setattr("astra_data.dataset.parquet.FILE_SIZE_LIMIT", 100)
+    patch.setattr("astra_data.dataset.format.VIDEO_FILE_SIZE_MB", 0)
     folder, total = tmp_path_factory.mktemp("cameras"), sum(LENGTHS.values()) + 1
     video, images = film(folder / "video.mp4", total), stills(folder / "images.parquet", total)
     first = 1
@@ -77,6 +84,8 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
             }
             opened.add(replace(fake_episode(uid, steps), cameras=clips))
             first += steps
+        patch.undo()
+    assert len([*(folder / "set").glob("data/*/*.parquet")]) == len([*(folder / "set").rglob("*.mp4")]) == 3
     return Dataset.open(folder / "set")
 
 
@@ -141,47 +150,81 @@ def test_lerobots_loader_shows_the_same_pictures(lerobot: SimpleNamespace, sourc
 
 @pytest.mark.parametrize(("codec", "group"), [("libx264", "12"), ("libx264", "250"), ("libx265", "250")])
 def test_frames_are_cut_within_groups_and_encoded_again_in_long_ones(codec: str, group: str, tmp_path: Path) -> None:
-    clip = Clip(film(tmp_path / "film.mp4", 90, codec, g=group), FRONT, 31 / FPS, 1 / FPS, 40)
+    clip = Clip(film(tmp_path / "film.mp4", 90, codec, g=group), FRONT, 31 / FPS, 1 / FPS, 39)
     written = ClipWriter(lambda number: tmp_path / f"{number}.mp4", FPS)
     spans = [written.add(clip), written.add(clip.part(5, 25))]
     written.close()
-    assert [round((span.to_s - span.from_s) * FPS) for span in spans] == [40, 20]
-    copies = [
-        decoded(Clip(tmp_path / f"{at.file}.mp4", FRONT, at.from_s, 1 / FPS, n))
-        for at, n in zip(spans, (40, 20), strict=True)
-    ]
-    before = decoded(clip)
-    assert np.abs(copies[0].astype(int) - before).mean() < 2 and np.abs(copies[1].astype(int) - before[5:25]).mean() < 2
-    if group == "12":
-        np.testing.assert_array_equal(copies[0], before)
-        np.testing.assert_array_equal(copies[1], before[5:25])
-        bases = [av.open(str(path)).streams.video[0].time_base for path in (clip.path, tmp_path / "0.mp4")]
-        assert bases[0] == bases[1]  # lerobot's merge joins files with one
+    assert [(span.file, round((span.to_s - span.from_s) * FPS)) for span in spans] == [(0, 39), (0, 20)]
+    pieces = zip(spans, (39, 20), strict=True)
+    copies = [decoded(Clip(tmp_path / "0.mp4", FRONT, at.from_s, 1 / FPS, count)) for at, count in pieces]
+    with av.open(str(tmp_path / "0.mp4")) as file, av.open(str(clip.path)) as source:
+        # lerobot's merge joins files with one time base.
+        assert group == "250" or file.streams.video[0].time_base == source.streams.video[0].time_base
+        keys = [
+            float(one.pts * one.time_base) for one in file.demux(video=0) if one.pts is not None and one.is_keyframe
+        ]
+    for found, before in zip(copies, (decoded(clip), decoded(clip)[5:25]), strict=True):
+        if group == "12":
+            np.testing.assert_array_equal(found, before)
+        assert np.abs(found.astype(int) - before).mean() < 2
+    assert spans[0].from_s == pytest.approx(0.0 if group == "250" else 7 / FPS)  # in a group of 12
+    assert any(spans[1].from_s == pytest.approx(key) for key in keys)
 
 
-def damaged(source: Dataset, root: Path, change: str) -> Path:
-    shutil.copytree(source.root, root)
-    (video,) = (root / "videos").rglob("*.mp4")
-    if change == "missing":
-        video.unlink()
-    else:
-        content = bytearray(video.read_bytes())
-        content[len(content) // 2] ^= 255
-        video.write_bytes(content)
-    return root
-
-
-@pytest.mark.parametrize("change", ["missing", "altered"])
-def test_a_damaged_video_is_refused_and_the_rest_is_recovered(source: Dataset, tmp_path: Path, change: str) -> None:
-    root = damaged(source, tmp_path / "damaged", change)
-    assert FRONT in check(root).faults[0] and change in check(root).faults[0]
-    with pytest.raises(CorruptDatasetError, match=change):
-        subset(Dataset.open(root), episodes=2, out=tmp_path / "half")
-    assert not (tmp_path / "half").exists()
+def test_an_altered_video_is_refused_and_costs_its_episode_alone(source: Dataset, tmp_path: Path) -> None:
+    root = shutil.copytree(source.root, tmp_path / "damaged")
+    video = min((root / "videos").rglob("*.mp4"))
+    content = bytearray(video.read_bytes())
+    content[len(content) // 2] ^= 255
+    video.write_bytes(content)
+    assert check(root).faults == [f"{FRONT} in episode 0: {video} was altered after it was written"]
+    assert Dataset.open(root).verify() == [f"{video} was altered after it was written"]
+    with pytest.raises(CorruptDatasetError, match="was altered"):
+        subset(Dataset.open(root), percent=100, out=tmp_path / "all")
+    assert not (tmp_path / "all").exists()
     notes = repair(root, out=tmp_path / "repaired").notes
-    assert any(FRONT in note and "left out" in note for note in notes)
+    assert f"left out the episode of uid 3: {video} was altered after it was written" in notes
+    assert_shows(tmp_path / "repaired", source, {uid: ALL[uid] for uid in (8, 5)})
+
+
+def test_without_its_videos_a_camera_is_left_out_and_the_rest_recovered(source: Dataset, tmp_path: Path) -> None:
+    root = shutil.copytree(source.root, tmp_path / "damaged")
+    shutil.rmtree(root / "videos")
+    with pytest.raises(CorruptDatasetError, match=f"{FRONT}: videos/{FRONT}/chunk-000/file-000.mp4, .* missing"):
+        Dataset.open(root)
+    assert any(f"{FRONT} is left out: videos/" in note for note in repair(root, out=tmp_path / "repaired").notes)
     whole = Dataset.open(tmp_path / "repaired")
     assert list(whole.cameras) == [TOP] and len(whole) == len(LENGTHS)
+
+
+@pytest.mark.parametrize("fault", ["missing", "expected 3", "1.950 s for 14 frames", "inside the folder"])
+def test_a_recording_whose_camera_cannot_be_found_opens_without_it(
+    source: Dataset, tmp_path: Path, caplog: pytest.LogCaptureFixture, fault: str
+) -> None:
+    root = shutil.copytree(source.root, tmp_path / "recording")
+    shutil.rmtree(root / "meta/astra")
+    [path] = (root / "meta/episodes").rglob("*.parquet")
+    rows = pq.read_table(path)
+    if fault == "missing":
+        shutil.rmtree(root / "videos")
+    elif fault == "inside the folder":
+        info = (root / "meta/info.json").read_text()
+        (root / "meta/info.json").write_text(info.replace('"videos/', '"../videos/'))
+    elif fault == "expected 3":
+        pq.write_table(rows[:2], path)
+    else:
+        ends = pa.array([2.0, *rows[f"videos/{FRONT}/to_timestamp"].to_pylist()[1:]])
+        name = f"videos/{FRONT}/to_timestamp"
+        pq.write_table(rows.set_column(rows.schema.get_field_index(name), name, ends), path)
+    found = Dataset.open(root)
+    assert list(found.cameras) == ([] if fault == "expected 3" else [TOP]) and len(found) == len(LENGTHS)
+    assert re.search(f"{FRONT} is left out: .*{fault}", caplog.text)
+
+
+def test_a_version_may_be_without_cameras(source: Dataset, tmp_path: Path) -> None:
+    with next_version(source, "episodes", cameras=False, stage="augment", config={}, out=tmp_path / "out") as opened:
+        opened.add(next(source.episodes()))
+    assert not Dataset.open(tmp_path / "out").cameras
 
 
 def test_cameras_are_shown_and_shared_with_their_dataset(source: Dataset) -> None:
@@ -211,7 +254,7 @@ def test_what_does_not_fit_is_refused(source: Dataset, tmp_path: Path) -> None:
         source.pictures("side", 0)
     with writer(tmp_path / "blind", columns=COLUMNS) as opened:
         opened.add(fake_episode(99, 4))
-    with pytest.raises(BadInputError, match=FRONT):
+    with pytest.raises(BadInputError, match=f"camera {FRONT}"):
         merge([source, Dataset.open(tmp_path / "blind")], out=tmp_path / "out")
     beyond = Clip(clips[FRONT].path, FRONT, 2.5, 1 / FPS, 9)
     assert "no frame at" in str(clip_fault(beyond)) and clip_fault(clips[FRONT]) is None
