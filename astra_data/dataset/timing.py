@@ -11,20 +11,8 @@ import numpy as np
 from astra_data.core.arrays import Bools, Floats, as_rows
 from astra_data.core.config import did_you_mean
 from astra_data.core.errors import BadInputError
-from astra_data.dataset.columns import (
-    DONE,
-    GOAL,
-    NEXT_STATE,
-    REWARD,
-    STATE,
-    SUCCESS,
-    TERMINATED,
-    TRUNCATED,
-    Array,
-    Column,
-    Episode,
-    new_uid,
-)
+from astra_data.dataset import columns as names
+from astra_data.dataset.columns import Array, Column, Episode, new_uid
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import next_version
 
@@ -156,8 +144,8 @@ def _condition(source: Dataset, text: str) -> Any:  # noqa: ANN401 - episode to 
 
 
 def _moves(episode: Episode) -> Bools:
-    state = as_rows(episode.columns[STATE])
-    after = as_rows(episode.columns.get(NEXT_STATE, np.concatenate([state[1:], state[-1:]])))
+    state = as_rows(episode.columns[names.STATE])
+    after = as_rows(episode.columns.get(names.NEXT_STATE, np.concatenate([state[1:], state[-1:]])))
     return np.asarray((state != after).any(axis=1))
 
 
@@ -170,7 +158,7 @@ def _pieces(episode: Episode, kept: Bools, source: Dataset, known: set[int]) -> 
             return
         columns, cameras = episode.part(first, end)
         if end < len(episode):
-            for name in {TRUNCATED, DONE} & columns.keys():
+            for name in {names.TRUNCATED, names.DONE} & columns.keys():
                 columns[name][-1] = True
         uid, metadata = episode.uid, _facts(columns, episode.metadata)
         if number:
@@ -183,15 +171,15 @@ def _pieces(episode: Episode, kept: Bools, source: Dataset, known: set[int]) -> 
 def _facts(columns: Mapping[str, Array], metadata: Mapping[str, Any]) -> dict[str, Any]:
     """Return the metadata, with return and success of the steps that are left."""
     changed = dict(metadata)
-    if "return" in changed and REWARD in columns:
-        changed["return"] = float(columns[REWARD].sum(dtype=np.float64))
-    if "success" in changed and SUCCESS in columns:
-        changed["success"] = bool(columns[SUCCESS].any())
+    if "return" in changed and names.REWARD in columns:
+        changed["return"] = float(columns[names.REWARD].sum(dtype=np.float64))
+    if "success" in changed and names.SUCCESS in columns:
+        changed["success"] = bool(columns[names.SUCCESS].any())
     return changed
 
 
 def _resampled(episode: Episode, schema: Sequence[Column], before: int, fps: int) -> Episode | None:
-    has_next = NEXT_STATE in episode.columns
+    has_next = names.NEXT_STATE in episode.columns
     duration_s = (len(episode) - (not has_next)) / before
     steps = int(duration_s * fps + 1e-6) + (not has_next)
     if steps < 1:
@@ -201,21 +189,21 @@ def _resampled(episode: Episode, schema: Sequence[Column], before: int, fps: int
     columns: dict[str, Array] = {}
     for column in schema:
         values = episode.columns[column.name]
-        if column.name == REWARD:
+        if column.name == names.REWARD:
             sums = np.concatenate([[0.0], np.cumsum(values, dtype=np.float64)])
             found = np.diff(sums[[*row[:-1], len(episode)]])
-        elif column.name in (TERMINATED, TRUNCATED, DONE, SUCCESS):
+        elif column.name in (names.TERMINATED, names.TRUNCATED, names.DONE, names.SUCCESS):
             counts = np.concatenate([[0], np.cumsum(values)])
             found = np.diff(counts[[*row[:-1], len(episode)]]) > 0
         elif (
             column.dtype == "float32"
             and column.name.removeprefix("next.").startswith("observation.")
-            and column.name != GOAL
+            and column.name != names.GOAL
         ):
-            of = episode.columns[STATE] if column.name == NEXT_STATE else values
-            if has_next and column.name in (STATE, NEXT_STATE):
-                of = np.concatenate([of, episode.columns[NEXT_STATE][-1:]])
-            at = times_s[1:] if column.name == NEXT_STATE else times_s[:-1]
+            of = episode.columns[names.STATE] if column.name == names.NEXT_STATE else values
+            if has_next and column.name in (names.STATE, names.NEXT_STATE):
+                of = np.concatenate([of, episode.columns[names.NEXT_STATE][-1:]])
+            at = times_s[1:] if column.name == names.NEXT_STATE else times_s[:-1]
             found = _interpolated(as_rows(of).astype(np.float64), at * before, column).reshape(steps, *values.shape[1:])
         else:
             found = values[np.minimum(row[:-1], len(episode) - 1)]

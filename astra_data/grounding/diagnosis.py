@@ -9,16 +9,8 @@ import torch
 
 from astra_data.core.arrays import Bools, Floats, Ints, as_rows
 from astra_data.core.errors import BadInputError
+from astra_data.dataset import columns as keys
 from astra_data.dataset.checkup import Finding
-from astra_data.dataset.columns import (
-    ABSTRACT_NEXT_STATE,
-    ABSTRACT_SIMULATED_NEXT_STATE,
-    ABSTRACT_STATE,
-    ACTION,
-    STATE,
-    SUCCESS,
-    TERMINATED,
-)
 from astra_data.dataset.compare import recordings_of
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import open_dataset
@@ -118,10 +110,10 @@ def diagnose(dataset: str | Path, simulator: str) -> Diagnosis:
         BadInputError: the dataset has not been paired, or has no two steps in a row.
     """
     source, pairing = open_dataset(dataset), pairing_named(simulator)
-    if ABSTRACT_STATE not in source.features:
-        raise BadInputError(f"{source.root} has no column {ABSTRACT_STATE}: expected a dataset that was paired")
+    if keys.ABSTRACT_STATE not in source.features:
+        raise BadInputError(f"{source.root} has no column {keys.ABSTRACT_STATE}: expected a dataset that was paired")
     log = _Log.of(source)
-    names = next(column for column in source.schema if column.name == ACTION).labels
+    names = next(column for column in source.schema if column.name == keys.ACTION).labels
     bounds = pairing.commands or Commands.recorded(dataset)
     responses, best_shift = _responses(log, pairing, names, source.info["fps"])
     missed = _missed(log, pairing)
@@ -152,7 +144,13 @@ class _Log:
 
     @classmethod
     def of(cls, source: Dataset) -> "_Log":
-        names = (ABSTRACT_STATE, STATE, ACTION, ABSTRACT_SIMULATED_NEXT_STATE, ABSTRACT_NEXT_STATE)
+        names = (
+            keys.ABSTRACT_STATE,
+            keys.STATE,
+            keys.ACTION,
+            keys.ABSTRACT_SIMULATED_NEXT_STATE,
+            keys.ABSTRACT_NEXT_STATE,
+        )
         columns = source.columns(names)
         lengths = source.lengths
         step = np.concatenate([np.arange(length) for length in lengths])
@@ -349,15 +347,15 @@ def _of_forecast(forecast: Forecast | None, missed: Sequence[Missed]) -> Iterato
         return
     now, (then, low, high) = float(np.median(forecast.left[-1])), forecast.expected
     then_text = f"{then:.2f} [{low:.2f}, {high:.2f}]"
-    told = f"of the simulator's error, {now:.2f} are left, with {forecast.more} recordings {then_text}"
+    what = f"of the simulator's error, {now:.2f} are left, with {forecast.more} recordings {then_text}"
     if forecast.is_enough:
-        yield Finding("note", told, "these are enough: more of the same make hardly a difference")
+        yield Finding("note", what, "these are enough: more of the same make hardly a difference")
     else:
         kinds = list(
             dict.fromkeys(one.where.partition("where ")[2].removesuffix(" as where not") for one in missed if one.where)
         )
         most = f", above all where {' and where '.join(kinds)}" if kinds else ""
-        yield Finding("note", told, f"record more{most}")
+        yield Finding("note", what, f"record more{most}")
 
 
 def _of_responses(responses: Sequence[Response], fps: float) -> Iterator[Finding]:
@@ -382,11 +380,11 @@ def _of_hidden_state(explained: dict[str, float]) -> Iterator[Finding]:
     if not explained or np.isnan([*explained.values()]).any():
         return
     present, history, recorded = explained.values()
-    told = f"of the simulator's error, the present explains {present:.2f}, a history {history:.2f}"
+    what = f"of the simulator's error, the present explains {present:.2f}, a history {history:.2f}"
     if history > present + _MATTERS:
-        yield Finding("note", told, "there is state that no single abstract state shows: train `astra`")
+        yield Finding("note", what, "there is state that no single abstract state shows: train `astra`")
     elif present > _MATTERS:
-        yield Finding("note", told, "nothing hidden shows: `nas`, or a parameter of the simulator, may do")
+        yield Finding("note", what, "nothing hidden shows: `nas`, or a parameter of the simulator, may do")
     if recorded > history + _MATTERS:
         advice = "the simulator may gain from more of the state in φ"
         yield Finding("note", f"the robot's whole recorded state explains {recorded:.2f} of it", advice)
@@ -412,12 +410,12 @@ def _of_commands(log: _Log, names: Sequence[str], bounds: Commands) -> Iterator[
 def _of_rates(source: Dataset, fps: float) -> Iterator[Finding]:
     """Yield the signals that are repeated from step to step: they come at a lower rate."""
     for column in source.schema:
-        if column.name not in (STATE, ACTION):
+        if column.name not in (keys.STATE, keys.ACTION):
             continue
         values = as_rows(source.columns([column.name])[column.name])
         same = np.concatenate([[False], (values[1:] == values[:-1]).all(axis=1)]) if len(values) else []
         rate = fps * (1 - float(np.mean(same)))
-        if column.name == STATE and rate < 0.8 * fps:
+        if column.name == keys.STATE and rate < 0.8 * fps:
             yield Finding(
                 "warning",
                 f"{column.name} changes {rate:.3g} times a second, of {fps:g} rows",
@@ -426,11 +424,11 @@ def _of_rates(source: Dataset, fps: float) -> Iterator[Finding]:
 
 
 def _of_failures(source: Dataset, log: _Log) -> Iterator[Finding]:
-    if TERMINATED not in source.features:
+    if keys.TERMINATED not in source.features:
         return
-    names = [name for name in (TERMINATED, SUCCESS) if name in source.features]
+    names = [name for name in (keys.TERMINATED, keys.SUCCESS) if name in source.features]
     columns = source.columns(names)
-    failed = columns[TERMINATED] & ~columns.get(SUCCESS, np.zeros(len(log.step), bool))
+    failed = columns[keys.TERMINATED] & ~columns.get(keys.SUCCESS, np.zeros(len(log.step), bool))
     count = int(failed.sum())
     if count < _FEW_FAILURES:
         yield Finding(
