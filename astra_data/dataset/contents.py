@@ -14,21 +14,13 @@ import pyarrow as pa
 from astra_data.core.arrays import Ints
 from astra_data.core.errors import BadInputError, CorruptDatasetError, in_short
 from astra_data.dataset import format as layout
+from astra_data.dataset import plain
 from astra_data.dataset.cameras import Camera, read_cameras
 from astra_data.dataset.columns import Array, Column, Scalar
 from astra_data.dataset.description import altered_files, read_description
 from astra_data.dataset.lerobot_rows import RecordedFiles
 from astra_data.dataset.parquet import read_arrays, read_blocks, rows_of, to_numpy
-from astra_data.dataset.plain import (
-    PlainColumn,
-    data_files,
-    episodes_files,
-    is_data_path,
-    read_footer,
-    read_tasks,
-    runs,
-    schema_faults,
-)
+from astra_data.dataset.plain import PlainColumn
 
 _LOCATION = ("length", "data/chunk_index", "data/file_index")
 
@@ -74,12 +66,12 @@ def _parsed(root: Path, description: dict[str, Any]) -> Contents:
     info, subsets = (
         json.loads((root / path).read_text(encoding="utf-8")) for path in (layout.INFO_PATH, layout.SUBSETS_PATH)
     )
-    if not is_data_path(info["data_path"]):
+    if not plain.is_data_path(info["data_path"]):
         raise BadInputError(f"expected a path inside the dataset's folder, got {info['data_path']!r}")
     cameras, faults_of = read_cameras(root, info, description.get("videos", {}))
     info["features"] = {name: it for name, it in info["features"].items() if name not in {*cameras, *faults_of}}
     columns = [Column.from_feature(name, feature) for name, feature in info["features"].items()]
-    tables = pa.concat_tables(read_blocks(episodes_files(root), _LOCATION))
+    tables = pa.concat_tables(read_blocks(plain.episodes_files(root), _LOCATION))
     lengths, chunks, files = (to_numpy(tables.column(name), 1, "int64") for name in _LOCATION)
     metadata = pa.concat_tables(read_blocks([root / layout.METADATA_PATH])).to_pydict()
     del metadata["length"]
@@ -89,16 +81,18 @@ def _parsed(root: Path, description: dict[str, Any]) -> Contents:
         path = root / info["data_path"].format(chunk_index=chunk, file_index=file)
         rows[path] = rows.get(path, 0) + length
     faults = [f"{name}: {fault}" for name, fault in faults_of.items()]
-    faults += [f"{path.relative_to(root)} does not belong to it" for path in sorted({*data_files(root)} - {*rows})]
+    faults += [
+        f"{path.relative_to(root)} does not belong to it" for path in sorted({*plain.data_files(root)} - {*rows})
+    ]
     for path, expected in rows.items():
-        name, footer = path.relative_to(root), read_footer(path)
+        name, footer = path.relative_to(root), plain.read_footer(path)
         if isinstance(footer, str):
             faults.append(f"{name} {footer}")
             continue
         faults += [f"{name} has {footer[0]} rows, expected {expected}"] if footer[0] != expected else []
         stored = [PlainColumn(column.name, column.dtype, column.size) for column in columns]
-        faults += [f"{name} {fault}" for fault in schema_faults(footer[1], stored)]
-    tasks = read_tasks(root)
+        faults += [f"{name} {fault}" for fault in plain.schema_faults(footer[1], stored)]
+    tasks = plain.read_tasks(root)
     if isinstance(tasks, str) or 0 not in tasks:
         faults.append(f"{layout.TASKS_PATH} {tasks if isinstance(tasks, str) else 'has no task 0'}")
     if faults:
@@ -155,7 +149,7 @@ def _converted(
     wanted = rows_of(episodes, recorded.first_rows, lengths, recorded.total_rows)
     stored = list(rows.stored.values())
     tables = read_blocks(contents.paths, list(rows.stored), wanted)
-    found = (run for run in runs(contents.root / "data", tables, stored) if len(run) > rows.dropped)
+    found = (run for run in plain.runs(contents.root / "data", tables, stored) if len(run) > rows.dropped)
     for position, (episode, run) in enumerate(zip_longest(episodes.tolist(), found)):
         if run is None or episode is None or len(run) != lengths[episode]:
             raise CorruptDatasetError("its files were altered while they were read")

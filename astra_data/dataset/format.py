@@ -7,16 +7,8 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from astra_data.dataset.columns import (
-    EPISODE_INDEX,
-    EPISODE_UID,
-    FRAME_INDEX,
-    INDEX,
-    TASK_INDEX,
-    TIMESTAMP,
-    Array,
-    Column,
-)
+from astra_data.dataset import columns as keys
+from astra_data.dataset.columns import Array, Column
 
 CODEBASE_VERSION = "v3.0"
 CHUNK_SIZE = 1000  # files per chunk folder
@@ -47,13 +39,13 @@ STATISTICS = ("min", "max", "mean", "std", "q01", "q10", "q50", "q90", "q99")
 STORED_STATISTICS = ("min", "max", "mean", "std", "count", "q01", "q10", "q50", "q90", "q99")  # in LeRobot's order
 
 DEFAULT_COLUMNS = (
-    Column(TIMESTAMP),
-    Column(FRAME_INDEX, "int64"),
-    Column(EPISODE_INDEX, "int64"),
-    Column(INDEX, "int64"),
-    Column(TASK_INDEX, "int64"),
+    Column(keys.TIMESTAMP),
+    Column(keys.FRAME_INDEX, "int64"),
+    Column(keys.EPISODE_INDEX, "int64"),
+    Column(keys.INDEX, "int64"),
+    Column(keys.TASK_INDEX, "int64"),
 )
-EPISODE_UID_COLUMN = Column(EPISODE_UID, "int64", meaning="names the episode for good")
+EPISODE_UID_COLUMN = Column(keys.EPISODE_UID, "int64", meaning="names the episode for good")
 
 _ENCODINGS = {"float32": "BYTE_STREAM_SPLIT", "int64": "DELTA_BINARY_PACKED"}
 
@@ -67,12 +59,12 @@ def reserved_values(steps: int, *, uid: int, episode: int, start: int, fps: floa
     """Return uid and LeRobot's own columns of an episode of `steps` from index `start`, (T,) each, in file order."""
     frames = np.arange(steps)
     return {
-        EPISODE_UID: np.full(steps, uid),
-        TIMESTAMP: frames / fps,
-        FRAME_INDEX: frames,
-        EPISODE_INDEX: np.full(steps, episode),
-        INDEX: frames + start,
-        TASK_INDEX: np.zeros_like(frames),
+        keys.EPISODE_UID: np.full(steps, uid),
+        keys.TIMESTAMP: frames / fps,
+        keys.FRAME_INDEX: frames,
+        keys.EPISODE_INDEX: np.full(steps, episode),
+        keys.INDEX: frames + start,
+        keys.TASK_INDEX: np.zeros_like(frames),
     }
 
 

@@ -11,22 +11,12 @@ from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.core.naming import first_few
 from astra_data.dataset import columns as names
 from astra_data.dataset import format as layout
-from astra_data.dataset import plain
+from astra_data.dataset import lerobot_rows, plain
 from astra_data.dataset.cameras import Camera, read_cameras
 from astra_data.dataset.columns import Column, Scalar
 from astra_data.dataset.contents import Contents
 from astra_data.dataset.description import ContentHash, Digests, complete_description, digest_of, permutation
-from astra_data.dataset.lerobot_rows import (
-    ENDS,
-    RecordedFiles,
-    Rows,
-    declared_columns,
-    ends_with,
-    lacking,
-    name_of,
-    our_columns,
-    robot_of,
-)
+from astra_data.dataset.lerobot_rows import RecordedFiles, Rows
 from astra_data.dataset.parquet import read_blocks
 from astra_data.dataset.statistics import Roundings
 
@@ -55,14 +45,14 @@ def open_recording(root: Path) -> Contents:
     places, _ = plain.read_places(root, info)
     if lost := plain.missing_files(root, places):
         raise CorruptDatasetError(f"{first_few(lost, MOST_FAULTS)} missing")
-    stored, specs, fps = declared_columns(root, info)
-    if missing := lacking(specs):
+    stored, specs, fps = lerobot_rows.declared_columns(root, info)
+    if missing := lerobot_rows.lacking(specs):
         raise BadInputError(
             f"{root}, recorded by LeRobot, has no {' and no '.join(missing)}: expected lists of numbers "
             "for the state and the action, and one number for a reward or flag"
         )
     rows = Rows({column.name: column for column in stored}, fps)
-    columns = our_columns(specs, has_tasks=len(tasks) > 1)
+    columns = lerobot_rows.our_columns(specs, has_tasks=len(tasks) > 1)
     roundings = Roundings(columns, {column.name: column.dtype for column in stored})
     episodes, content_hash, digests = _survey(root, rows, columns, tasks, info, roundings)
     kept = [episode for episode in episodes if episode.steps]
@@ -74,7 +64,12 @@ def open_recording(root: Path) -> Contents:
     uids, lengths = [episode.uid for episode in kept], np.array([episode.steps for episode in kept])
     positions = {uid: index for index, uid in enumerate(uids)}
     described = {"codebase_version": layout.CODEBASE_VERSION}
-    description = {"name": name_of(root), "stage": "record", "config": described, "environment": robot_of(info)}
+    description = {
+        "name": lerobot_rows.name_of(root),
+        "stage": "record",
+        "config": described,
+        "environment": lerobot_rows.robot_of(info),
+    }
     all_columns, frames = layout.stored_columns(columns), int(lengths.sum())
     return Contents(
         root=root,
@@ -120,7 +115,7 @@ def _survey(
     tables = read_blocks(plain.data_files(root), [column.name for column in stored])
     for number, run in enumerate(plain.runs(root / "data", tables, stored)):
         faults += [fault for _, fault in plain.run_faults(run, number=number, row=row, fps=rows.fps)]
-        flags = {name: run.columns[name] for name in ENDS if name in rows.stored}
+        flags = {name: run.columns[name] for name in lerobot_rows.ENDS if name in rows.stored}
         faults += plain.flag_faults(flags, f"episode {number} ")
         if len(faults) >= MOST_FAULTS:
             break
@@ -157,10 +152,10 @@ def found_in(run: plain.Run, rows: Rows, tasks: Mapping[int, str], *, row: int, 
     """Return the episode of the rows `run`, which begins in the given row of the files."""
     columns, facts = run.columns, dict[str, Scalar]()
     lost_success, lost_reward = False, 0.0
-    is_terminated = ends_with(names.TERMINATED, run)
+    is_terminated = lerobot_rows.ends_with(names.TERMINATED, run)
     if (success := columns.get(names.SUCCESS)) is not None:
         facts["success"] = bool(success.any())
-        is_over = is_terminated or ends_with(names.DONE, run)
+        is_over = is_terminated or lerobot_rows.ends_with(names.DONE, run)
         lost_success = bool(rows.dropped and success[-1] and not success[:-1].any() and not is_over)
     if len(tasks) > 1:
         facts["task"] = tasks.get(int(columns[names.TASK_INDEX][0]), "unknown")

@@ -38,10 +38,8 @@ class Response:
 
     name: str
     weights: Floats
-    gain: tuple[float, float, float]
-    """Sum of the weights: value, low, high; 1 if the robot moves as far as the simulator."""
-    delay_s: tuple[float, float, float]
-    """Mean of the lags by their weights: dead time and time constant together; value, low, high."""
+    gain: tuple[float, float, float]  # sum of the weights: value, low, high; 1 if as far as in the simulator
+    delay_s: tuple[float, float, float]  # mean lag, dead time and time constant together: value, low, high
 
     @property
     def is_visible(self) -> bool:
@@ -56,10 +54,8 @@ class Missed:
     name: str
     unit: str
     error: float
-    still: float
-    """That of the persistence baseline."""
-    where: str
-    """Where it is largest; empty if it is alike everywhere."""
+    still: float  # that of the persistence baseline
+    where: str  # where it is largest; empty if it is alike everywhere
 
 
 @dataclass(frozen=True)
@@ -72,10 +68,8 @@ class Forecast:
 
     sizes: tuple[int, ...]
     left: Floats
-    more: int
-    """Half as many recordings again."""
-    expected: tuple[float, float, float]
-    """What is left with that many: value, low, high."""
+    more: int  # half as many recordings again
+    expected: tuple[float, float, float]  # what is left with that many: value, low, high
 
     @property
     def is_enough(self) -> bool:
@@ -89,13 +83,10 @@ class Diagnosis:
 
     reference: str
     responses: tuple[Response, ...]
-    best_shift: int
-    """Steps by which the commands are shifted where the simulator's one-step error is least."""
+    best_shift: int  # steps by which the commands are shifted where the simulator's one-step error is least
     missed: tuple[Missed, ...]
-    explained: dict[str, float]
-    """R² of the simulator's error on held-out recordings, by what it is predicted from; at least 0."""
-    forecast: Forecast | None
-    """None of fewer than `FEWEST` recordings."""
+    explained: dict[str, float]  # R² of the simulator's error on held-out recordings, by what predicts it; 0 or more
+    forecast: Forecast | None  # None of fewer than `FEWEST` recordings
     findings: tuple[Finding, ...]
 
 
@@ -408,19 +399,15 @@ def _of_commands(log: _Log, names: Sequence[str], bounds: Commands) -> Iterator[
 
 
 def _of_rates(source: Dataset, fps: float) -> Iterator[Finding]:
-    """Yield the signals that are repeated from step to step: they come at a lower rate."""
-    for column in source.schema:
-        if column.name not in (keys.STATE, keys.ACTION):
-            continue
-        values = as_rows(source.columns([column.name])[column.name])
-        same = np.concatenate([[False], (values[1:] == values[:-1]).all(axis=1)]) if len(values) else []
-        rate = fps * (1 - float(np.mean(same)))
-        if column.name == keys.STATE and rate < 0.8 * fps:
-            yield Finding(
-                "warning",
-                f"{column.name} changes {rate:.3g} times a second, of {fps:g} rows",
-                "it is sampled more slowly than it was logged: import with its own rate (`fps`)",
-            )
+    """Yield a warning if the state is repeated from step to step: it comes at a lower rate."""
+    values = as_rows(source.columns([keys.STATE])[keys.STATE])
+    rate = fps * float((values[1:] != values[:-1]).any(axis=1).mean()) if len(values) > 1 else fps
+    if rate < 0.8 * fps:
+        yield Finding(
+            "warning",
+            f"{keys.STATE} changes {rate:.3g} times a second, of {fps:g} rows",
+            "it is sampled more slowly than it was logged: import with its own rate (`fps`)",
+        )
 
 
 def _of_failures(source: Dataset, log: _Log) -> Iterator[Finding]:

@@ -13,19 +13,9 @@ from numpy.typing import NDArray
 from astra_data.core.arrays import as_column, as_rows
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import first_few
+from astra_data.dataset import columns as keys
 from astra_data.dataset.checkup import Clock, full_turns, shortest
-from astra_data.dataset.columns import (
-    DONE,
-    NEXT_STATE,
-    REWARD,
-    STATE,
-    SUCCESS,
-    TERMINATED,
-    TRUNCATED,
-    Array,
-    Column,
-    Scalar,
-)
+from astra_data.dataset.columns import Array, Column, Scalar
 from astra_data.dataset.inspection import Endings, is_terminated
 from astra_data.dataset.lerobot_rows import DERIVED_FLAGS, next_state_of
 from astra_data.dataset.statistics import Rounding
@@ -118,7 +108,7 @@ class Cutter:
             self._spent.append(np.zeros(3))
         fields = {name: np.asarray(values).reshape(n, -1) for name, values in block.values.items()}
         ends = [fields[name] for name in mapping.split.ends]
-        ends += [columns[name].reshape(n, -1) for name in (TERMINATED, TRUNCATED) if name in columns]
+        ends += [columns[name].reshape(n, -1) for name in (keys.TERMINATED, keys.TRUNCATED) if name in columns]
         times = fields[mapping.time][:, 0] if mapping.time else np.full(n, np.nan)
         table = columns | {
             "/finite": ~rejected,
@@ -178,7 +168,7 @@ class Cutter:
         episode = np.searchsorted(starts, np.where(is_of_next, after, before), side="right") - 1
         [rejected] = np.nonzero(~table["/finite"])
         ends = rejected[(before[rejected] >= 0) & (apart[kept[before[rejected]]] == apart[rejected])]
-        for name in (TERMINATED, SUCCESS):
+        for name in (keys.TERMINATED, keys.SUCCESS):
             if name in table:  # if a rejected row ends its episode, the last row of it that is kept does so
                 np.logical_or.at(table[name], kept[before[ends]], table[name][ends])
         bad = {int(episode[at]): at for at in rejected[::-1].tolist()} if self._skips else {}
@@ -238,43 +228,43 @@ class Cutter:
         """Yield an episode with next states and ends, unless it is too short."""
         ended_before, self._ended = self._ended, is_terminated(episode)
         length = len(next(iter(episode.values())))
-        if ended_before and self._ended and length == 1 and NEXT_STATE not in episode:
+        if ended_before and self._ended and length == 1 and keys.NEXT_STATE not in episode:
             self.tally.rows_after_end += 1
             return
-        if STATE in episode and NEXT_STATE not in episode:
+        if keys.STATE in episode and keys.NEXT_STATE not in episode:
             episode = self._with_next_states(episode)
-            length = len(episode[STATE])
+            length = len(episode[keys.STATE])
         if length < self._mapping.min_steps:
             self.tally.short_rows += length
             return
-        terminated = episode.setdefault(TERMINATED, np.zeros(length, bool))
-        truncated = episode.get(TRUNCATED, np.zeros(length, bool)).copy()
+        terminated = episode.setdefault(keys.TERMINATED, np.zeros(length, bool))
+        truncated = episode.get(keys.TRUNCATED, np.zeros(length, bool)).copy()
         truncated[-1] |= not terminated[-1]
-        episode |= {TRUNCATED: truncated, DONE: terminated | truncated}
+        episode |= {keys.TRUNCATED: truncated, keys.DONE: terminated | truncated}
         self.tally.endings.add(episode)
-        if REWARD in episode:
-            metadata["return"] = float(episode[REWARD].sum(dtype=np.float64))
+        if keys.REWARD in episode:
+            metadata["return"] = float(episode[keys.REWARD].sum(dtype=np.float64))
         yield episode, metadata
 
     def _with_next_states(self, episode: dict[str, Array]) -> dict[str, Array]:
         """Add the state of the next row to each row, and drop the last or let it stand still."""
-        state, terminated, tally = episode[STATE], is_terminated(episode), self.tally
+        state, terminated, tally = episode[keys.STATE], is_terminated(episode), self.tally
         if terminated and self._mapping.terminal == "stand_still":
-            return episode | {NEXT_STATE: np.concatenate([state[1:], state[-1:]])}
+            return episode | {keys.NEXT_STATE: np.concatenate([state[1:], state[-1:]])}
         tally.last_rows += 1
         tally.last_terminated += terminated
         kept = {name: values[:-1].copy() for name, values in episode.items()}
         is_handed = len(state) > 1 and terminated
-        if len(state) > 1 and SUCCESS in kept:
+        if len(state) > 1 and keys.SUCCESS in kept:
             # The row's state is the one that the step before leads to.
-            kept[SUCCESS][-1] = episode[SUCCESS][-1] or (kept[SUCCESS][-1] and not terminated)
+            kept[keys.SUCCESS][-1] = episode[keys.SUCCESS][-1] or (kept[keys.SUCCESS][-1] and not terminated)
         if is_handed:
-            kept[TERMINATED][-1] = True
-        if REWARD in kept and is_handed:
-            kept[REWARD][-1] += episode[REWARD][-1]
-        elif REWARD in kept:
-            tally.last_reward += float(episode[REWARD][-1])
-        return kept | {NEXT_STATE: state[1:]}
+            kept[keys.TERMINATED][-1] = True
+        if keys.REWARD in kept and is_handed:
+            kept[keys.REWARD][-1] += episode[keys.REWARD][-1]
+        elif keys.REWARD in kept:
+            tally.last_reward += float(episode[keys.REWARD][-1])
+        return kept | {keys.NEXT_STATE: state[1:]}
 
     def check(self) -> None:
         """Compare fps to the rates of files, on average and without pauses; tally these, and what float32 rounds."""
@@ -330,9 +320,11 @@ class Cutter:
                 source = sources[spec.take[entry] if spec.take else entry]
                 bad[source] = bad.get(source, False) | ~finite[:, entry]
         sizes = {name: column.size for name, column in self._converted.items()} if not faults else {}
-        if sizes.get(NEXT_STATE) not in (None, sizes.get(STATE)):
-            faults.append(f"{NEXT_STATE} has {sizes[NEXT_STATE]} values, {STATE} {sizes.get(STATE, 0)}")
-        flags = [name for name in (REWARD, *MAPPED_FLAGS) if sizes.get(name, 1) > 1]
+        if sizes.get(keys.NEXT_STATE) not in (None, sizes.get(keys.STATE)):
+            faults.append(
+                f"{keys.NEXT_STATE} has {sizes[keys.NEXT_STATE]} values, {keys.STATE} {sizes.get(keys.STATE, 0)}"
+            )
+        flags = [name for name in (keys.REWARD, *MAPPED_FLAGS) if sizes.get(name, 1) > 1]
         faults += [f"{name}: {sizes[name]} values, expected 1" for name in flags]
         if sizes and (jump := self._mapping.split.jump) and max(jump.values) >= (size := sizes[jump.column]):
             where = f"{jump.column} has {size} values, counted from 0"
@@ -365,16 +357,16 @@ def column_of(name: str, spec: ColumnMapping, size: int) -> Column:
 
 def _complete(converted: dict[str, Column], terminal: str) -> tuple[Column, ...]:
     columns = dict(converted)
-    if STATE in columns:
-        following = next_state_of(columns[STATE])
-        if recorded := columns.get(NEXT_STATE):
+    if keys.STATE in columns:
+        following = next_state_of(columns[keys.STATE])
+        if recorded := columns.get(keys.NEXT_STATE):
             names, meaning = recorded.names or following.names, recorded.meaning or following.meaning
             astra = {**(following.astra or {}), **(recorded.astra or {})} or None
             following = replace(following, names=names, meaning=meaning, astra=astra)
-        elif TERMINATED in columns and terminal == "stand_still":
+        elif keys.TERMINATED in columns and terminal == "stand_still":
             made_up = "; where an episode terminates, not recorded: the state itself"
             following = replace(following, meaning=f"{following.meaning}{made_up}")
-        columns[NEXT_STATE] = following
+        columns[keys.NEXT_STATE] = following
     return (*columns.values(), *(column for column in DERIVED_FLAGS if column.name not in columns))
 
 

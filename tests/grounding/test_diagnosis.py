@@ -35,9 +35,19 @@ class Axes:
 
 
 def recorded(
-    folder: Path, dead: tuple[int, int] = (0, 0), lag_s: float = 0.0, *, fails: int = 0, same: bool = False
+    folder: Path,
+    dead: tuple[int, int] = (0, 0),
+    lag_s: float = 0.0,
+    *,
+    fails: int = 0,
+    same: bool = False,
+    gains: tuple[float, float] = (0.9, 0.5),
+    held: int = 1,
 ) -> Diagnosis:
-    """Return the diagnosis of 12 recordings of 150 steps, in which commands act `dead` steps late and with a lag."""
+    """Return the diagnosis of 12 recordings of 150 steps, in which commands act `dead` steps late and with a lag.
+
+    The state is repeated for `held` steps.
+    """
     (folder / "axes.py").write_text(SIMULATOR)
     rng, follows = np.random.default_rng(0), 1.0 if not lag_s else 1 - np.exp(-0.1 / lag_s)
     columns = [Column(STATE, size=4, names=("x", "y", "vx", "vy")), Column(NEXT_STATE, size=4)]
@@ -52,9 +62,9 @@ def recorded(
             state = np.zeros((151, 4))
             for step in range(150):
                 told = [command[10 + step - dead[axis], axis] for axis in (0, 1)]
-                velocity = state[step, 2:] + follows * (np.array(told) * [0.9, 0.5] - state[step, 2:])
+                velocity = state[step, 2:] + follows * (np.array(told) * gains - state[step, 2:])
                 state[step + 1] = [*(state[step, :2] + 0.1 * velocity), *velocity]
-            ended = np.zeros(150, bool)
+            state, ended = state[np.arange(151) // held * held], np.zeros(150, bool)
             ended[-1] = number < fails
             values = {STATE: state[:-1], NEXT_STATE: state[1:], ACTION: command[10:160]}
             values |= {TERMINATED: ended, SUCCESS: np.zeros(150, bool)}
@@ -96,6 +106,14 @@ def test_what_one_parameter_would_mend_is_not_hidden_state(tmp_path: Path) -> No
     # y lags half of 0.1 m/s² behind, x a tenth; a command of ±1 has an RMS of 1/√3.
     assert y.error == pytest.approx(0.05 / np.sqrt(3), rel=0.1) and x.error == pytest.approx(0.01 / np.sqrt(3), rel=0.1)
     assert y.still == pytest.approx(y.error, rel=0.01) and " times as large where " in y.where
+
+
+def test_a_command_without_effect_and_a_slow_sensor_are_warned_of(tmp_path: Path) -> None:
+    whats = [line.what for line in recorded(tmp_path, gains=(0.9, 0.0), held=2).findings if line.severity == "warning"]
+    assert any(what.startswith("push has no effect that can be seen (") for what in whats)
+    assert not any(what.startswith("pull has") for what in whats)
+    [rate] = [what for what in whats if what.endswith(" times a second, of 10 rows")]
+    assert float(rate.split()[2]) == pytest.approx(5, abs=0.1)
 
 
 def test_commands_that_only_vary_together_are_warned_of(tmp_path: Path) -> None:

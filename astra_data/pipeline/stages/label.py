@@ -12,20 +12,9 @@ from astra_data.core.durable import make_folder, refuse_existing
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, silent
 from astra_data.core.seeding import generator
+from astra_data.dataset import columns as names
 from astra_data.dataset.checkup import continuity
-from astra_data.dataset.columns import (
-    DONE,
-    GOAL,
-    NEXT_STATE,
-    OUTCOME_COLUMNS,
-    REWARD,
-    STATE,
-    SUCCESS,
-    TERMINATED,
-    TRUNCATED,
-    Array,
-    Episode,
-)
+from astra_data.dataset.columns import Array, Episode
 from astra_data.dataset.compare import column_faults, names_apart
 from astra_data.dataset.inspection import is_terminated, outcome_of
 from astra_data.dataset.reader import Dataset
@@ -64,7 +53,7 @@ def label(
     """
     world, source = task_named(task), opened(data)
     check_fits(source, world)
-    more = [one for one in (world.goal, *OUTCOME_COLUMNS) if one and one.name not in source.features]
+    more = [one for one in (world.goal, *names.OUTCOME_COLUMNS) if one and one.name not in source.features]
     for warning in remarks(source, world):
         _log.warning(warning)
     if not more:
@@ -90,36 +79,36 @@ def label(
             steps += len(labeled)
             successes += bool(labeled.metadata["success"])
             failures += bool(labeled.metadata["failed"])
-            if SUCCESS not in episode.columns and labeled.metadata["failed"]:
-                after = _abstracted(world, labeled.columns[NEXT_STATE][-1:])
+            if names.SUCCESS not in episode.columns and labeled.metadata["failed"]:
+                after = _abstracted(world, labeled.columns[names.NEXT_STATE][-1:])
                 at_goal += bool(judged(world.objective, "reached", after, _goals(world, labeled, seed)[-1:]))
             progress(number / len(source), f"{successes} successes, {failures} failures in {steps:,} steps")
         writer.made = {"dropped_steps": int(source.lengths.sum()) - steps}
     if at_goal:
-        fault = f"{at_goal} episodes terminate at their goal and are labeled as failures, because {TERMINATED}"
-        advice = f"also import {SUCCESS} if they ended on arrival"
+        fault = f"{at_goal} episodes terminate at their goal and are labeled as failures, because {names.TERMINATED}"
+        advice = f"also import {names.SUCCESS} if they ended on arrival"
         _log.warning("%s", f"{source.reference}: {fault} does not say why: {advice}")
     return writer.root
 
 
 def remarks(source: Dataset, task: Task) -> list[str]:
     """Say what is to be checked of a dataset that fits a task."""
-    torn = continuity(source.episodes([STATE, NEXT_STATE]))
+    torn = continuity(source.episodes([names.STATE, names.NEXT_STATE]))
     found = [f"{finding.what}: {finding.advice}" for finding in torn]
     if named := names_apart(source, (task.state, task.action), task.name):
         found.append(named)
-    has_ends = TERMINATED in source.features and SUCCESS not in source.features
-    if has_ends and all(is_terminated(episode.columns) for episode in source.episodes([TERMINATED])):
+    has_ends = names.TERMINATED in source.features and names.SUCCESS not in source.features
+    if has_ends and all(is_terminated(episode.columns) for episode in source.episodes([names.TERMINATED])):
         found.append(
-            f"{source.reference}: each of the {len(source)} episodes ends as {TERMINATED} and counts as a "
-            f"failure, as there is no {SUCCESS}: import that too if they succeeded, or leave {TERMINATED} "
+            f"{source.reference}: each of the {len(source)} episodes ends as {names.TERMINATED} and counts as a "
+            f"failure, as there is no {names.SUCCESS}: import that too if they succeeded, or leave {names.TERMINATED} "
             "out of the mapping if it only marks where each recording ends"
         )
-    if task.goal is not None and GOAL not in source.features:
+    if task.goal is not None and names.GOAL not in source.features:
         alike = [name for name in source.features if "goal" in name.lower()]
         mistaken = f" ({', '.join(alike)} is not read as one)" if alike else ""
         found.append(
-            f"{source.reference} has no {GOAL}{mistaken}: goals are drawn by the objective, one an episode "
+            f"{source.reference} has no {names.GOAL}{mistaken}: goals are drawn by the objective, one an episode "
             f"(goal_size is {task.objective.goal_size}); import those that the robot had into that column"
         )
     return found
@@ -128,14 +117,14 @@ def remarks(source: Dataset, task: Task) -> list[str]:
 def with_outcomes(task: Task, episode: Episode, seed: int) -> Episode:
     """Return the episode with goals and outcomes, up to its first success; what it has of them is kept."""
     given = episode.columns
-    before, after = (_abstracted(task, given[key]) for key in (STATE, NEXT_STATE))
+    before, after = (_abstracted(task, given[key]) for key in (names.STATE, names.NEXT_STATE))
     goal = _goals(task, episode, seed)
-    over = torch.from_numpy(given.get(TERMINATED, np.zeros(len(episode), bool)))
+    over = torch.from_numpy(given.get(names.TERMINATED, np.zeros(len(episode), bool)))
     missed = judged(task.objective, "missed", after, goal)
     reached = judged(task.objective, "reached", after, goal) & ~over
-    success = torch.from_numpy(given[SUCCESS]) if SUCCESS in given else reached.clone()
+    success = torch.from_numpy(given[names.SUCCESS]) if names.SUCCESS in given else reached.clone()
     failed = (over | missed) & ~success
-    if SUCCESS in given:
+    if names.SUCCESS in given:
         # That what is to last did so ends no episode.
         reached = reached if task.objective.is_lasting else success
     else:
@@ -146,9 +135,9 @@ def with_outcomes(task: Task, episode: Episode, seed: int) -> Episode:
     length = int(terminated.argmax()) + 1 if terminated.any() else len(episode)
     truncated = np.zeros(len(episode), bool)
     truncated[length - 1] = not terminated[length - 1]
-    columns: dict[str, Array] = {GOAL: as_column(goal.numpy())} if task.goal else {}
-    columns |= {REWARD: reward.astype(np.float32), SUCCESS: success.numpy(), **given}
-    columns |= {TERMINATED: terminated, TRUNCATED: truncated, DONE: terminated | truncated}
+    columns: dict[str, Array] = {names.GOAL: as_column(goal.numpy())} if task.goal else {}
+    columns |= {names.REWARD: reward.astype(np.float32), names.SUCCESS: success.numpy(), **given}
+    columns |= {names.TERMINATED: terminated, names.TRUNCATED: truncated, names.DONE: terminated | truncated}
     kept = {key: values[:length] for key, values in columns.items()}
     cameras = episode.part(0, length)[1]
     return Episode(episode.uid, kept, dict(episode.metadata) | outcome_of(kept), cameras)
@@ -161,8 +150,8 @@ def _abstracted(task: Task, states: Array) -> Tensor:
 
 
 def _goals(task: Task, episode: Episode, seed: int) -> Tensor:
-    if GOAL in episode.columns:
-        return torch.from_numpy(as_rows(episode.columns[GOAL]))
+    if names.GOAL in episode.columns:
+        return torch.from_numpy(as_rows(episode.columns[names.GOAL]))
     with explained("objective.draw_goals(rng, 1)"):
         drawn = task.objective.draw_goals(generator(seed, f"goal of episode {episode.uid}"), 1)
     return torch.from_numpy(drawn).float().expand(len(episode), -1).contiguous()
@@ -177,11 +166,11 @@ def check_fits(source: Dataset, task: Task) -> None:
     for expected in (task.state, task.action):
         faults += column_faults(source, expected, task.name)
     goal_size = task.goal.size if task.goal else 0
-    if GOAL in source.features and (found := source.features[GOAL]["shape"][0]) != goal_size:
+    if names.GOAL in source.features and (found := source.features[names.GOAL]["shape"][0]) != goal_size:
         faults.append(
-            f"{GOAL} has {found} values, goals of {task.name} have {goal_size}: import it without that column"
+            f"{names.GOAL} has {found} values, goals of {task.name} have {goal_size}: import it without that column"
         )
-    if NEXT_STATE not in source.features:
-        faults.append(f"has no column {NEXT_STATE}")
+    if names.NEXT_STATE not in source.features:
+        faults.append(f"has no column {names.NEXT_STATE}")
     if faults:
         raise BadInputError(f"{source.reference} {'; '.join(faults)}")

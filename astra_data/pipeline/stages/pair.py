@@ -12,17 +12,9 @@ from astra_data.core.arrays import as_column, as_rows
 from astra_data.core.config import Config, NotNegative
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, Stopwatch, silent
+from astra_data.dataset import columns as keys
 from astra_data.dataset.checkup import LARGEST, TURNS, is_angle
-from astra_data.dataset.columns import (
-    ABSTRACT_NEXT_STATE,
-    ABSTRACT_SIMULATED_NEXT_STATE,
-    ABSTRACT_STATE,
-    ACTION,
-    NEXT_STATE,
-    STATE,
-    Array,
-    in_blocks,
-)
+from astra_data.dataset.columns import Array, in_blocks
 from astra_data.dataset.compare import column_faults, names_apart
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import next_version, open_dataset
@@ -75,9 +67,9 @@ def pair(
     batch = built(pairing, BATCH)
     bounds = {} if pairing.commands is None else {"commands": {k: list(v) for k, v in pairing.commands.items()}}
     meanings = {
-        ABSTRACT_STATE: "abstract state of the target before the action",
-        ABSTRACT_NEXT_STATE: "abstract state of the target after the action",
-        ABSTRACT_SIMULATED_NEXT_STATE: "where the abstract simulator lands, reset to abstract.state",
+        keys.ABSTRACT_STATE: "abstract state of the target before the action",
+        keys.ABSTRACT_NEXT_STATE: "abstract state of the target after the action",
+        keys.ABSTRACT_SIMULATED_NEXT_STATE: "where the abstract simulator lands, reset to abstract.state",
     }
     added = [replace(pairing.abstract_state, name=name, meaning=text) for name, text in meanings.items()]
     steps, simulating, reset_error, farthest = 0, 0.0, 0.0, np.zeros(added[0].size)
@@ -94,15 +86,18 @@ def pair(
     ) as writer:
         for episodes in in_blocks(source.episodes(), _BLOCK):
             before = time.perf_counter()
-            columns = [np.concatenate([one.columns[name] for one in episodes]) for name in (STATE, ACTION, NEXT_STATE)]
+            columns = [
+                np.concatenate([one.columns[name] for one in episodes])
+                for name in (keys.STATE, keys.ACTION, keys.NEXT_STATE)
+            ]
             tolerance = config.reset_tolerance
             paired, error = pair_steps(pairing, batch, *map(as_rows, columns), tolerance=tolerance, first_step=steps)
             simulating += time.perf_counter() - before
             reset_error = max(reset_error, error)
-            apart = paired[ABSTRACT_NEXT_STATE] - paired[ABSTRACT_SIMULATED_NEXT_STATE]
+            apart = paired[keys.ABSTRACT_NEXT_STATE] - paired[keys.ABSTRACT_SIMULATED_NEXT_STATE]
             for unit, turn in TURNS.items():
                 jumps[unit] += (np.abs(apart) > turn / 2).sum(axis=0)
-            farthest = np.maximum(farthest, np.abs(paired[ABSTRACT_STATE]).max(axis=0))
+            farthest = np.maximum(farthest, np.abs(paired[keys.ABSTRACT_STATE]).max(axis=0))
             first = 0
             for episode in episodes:
                 values = {name: as_column(array[first : first + len(episode)]) for name, array in paired.items()}
@@ -176,9 +171,9 @@ def pair_steps(
             )
         landed[first : first + size] = reached[: len(state) - first]
     columns = {
-        ABSTRACT_STATE: abstract,
-        ABSTRACT_NEXT_STATE: checked_abstraction(pairing, next_state),
-        ABSTRACT_SIMULATED_NEXT_STATE: landed,
+        keys.ABSTRACT_STATE: abstract,
+        keys.ABSTRACT_NEXT_STATE: checked_abstraction(pairing, next_state),
+        keys.ABSTRACT_SIMULATED_NEXT_STATE: landed,
     }
     return columns, largest
 
@@ -196,9 +191,9 @@ def _check(source: Dataset, pairing: Pairing) -> None:
             f"{source.reference} was collected for {task}, which has another maze than "
             f"{pairing.origin['task']}: give --simulator {task}"
         )
-    faults = [f"no column {name}" for name in (STATE, ACTION, NEXT_STATE) if name not in source.features]
-    if ABSTRACT_STATE in source.features:
-        faults.append(f"{ABSTRACT_STATE} already: it is paired")
+    faults = [f"no column {name}" for name in (keys.STATE, keys.ACTION, keys.NEXT_STATE) if name not in source.features]
+    if keys.ABSTRACT_STATE in source.features:
+        faults.append(f"{keys.ABSTRACT_STATE} already: it is paired")
     if pairing.fps not in (None, source.info["fps"]):
         faults.append(f"{source.info['fps']} steps per second, where {pairing.id} makes {pairing.fps}")
     if faults:
