@@ -72,9 +72,9 @@ def test_a_terminated_row_without_a_next_state_hands_its_outcome_to_the_step_bef
     columns = {STATE: {"fields": ("x",)}, ACTION: {"fields": ("a",)}, REWARD: {"fields": ("a",)}}
     columns |= {TERMINATED: {"fields": ("over",)}, SUCCESS: {"fields": ("there",)}}
     cutting = cutter(columns=columns)
-    over, there = [0, 0, 1, 0, 1, 1, 0, 0], [0, 0, 1, 0, 0, 0, 0, 1]
+    over, there = [0, 0, 1, 0, 1, 1, 0, 0], [0, 0, 1, 1, 0, 0, 0, 1]
     episodes = cut(cutting, x=np.arange(8) * 2, over=over, there=there)
-    # Row 5 is alone; row 7 is cut off, and step 6 leads to where it succeeds.
+    # Row 3 leads to no success; row 5 is alone; row 7 is cut off, and step 6 leads to where it succeeds.
     assert rows(episodes) == [[0, 1], [3], [6]]
     assert [episode[REWARD].tolist() for episode in episodes] == [[0, 1 + 2], [3 + 4], [6]]
     assert [episode[NEXT_STATE].tolist() for episode in episodes] == [[2, 4], [8], [14]]
@@ -119,7 +119,7 @@ def test_gaps_are_measured_between_the_rows_that_are_kept() -> None:
     cutting.check()
     alone = [0, nan, nan, 0.0]
     assert rows(cut(cutter(time="t", split=split, not_finite="drop"), x=alone, t=t[:4])) == []
-    small = cutter(time="t", split={"gap_s": 1.0}, not_finite="drop")
+    small = cutter(time="t", split={"gap_s": 0.9}, not_finite="drop")
     assert rows(cut(small, x=x, t=t)) == [[0, 1, 4, 5, 6]]
 
 
@@ -170,13 +170,13 @@ def test_episodes_of_other_rates_are_named_where_a_format_has_its_own() -> None:
 
 
 def test_jumps_are_longer_than_their_bound() -> None:
-    position = {"fields": ("x",), "scale": (0.001,)}
+    position = {"fields": ("x",), "scale": (0.125,)}
     cutting = cutter(
         columns={STATE: position, ACTION: {"fields": ("a",)}},
         split={"jump": {"column": STATE, "values": (0, 1), "above": 0.5}},
     )
-    # 0.499 m, then 0.51 m in both directions together, and 10 in a value that does not count.
-    x = np.array([[0, 0, 0], [300, 399, 0], [300, 399, 9], [660, 760, 9], [660, 760, 1e4]])
+    # 0.5 m, then 0.53 m in both directions together, and 1,249 in a value that does not count.
+    x = np.array([[0, 0, 0], [4, 0, 0], [4, 0, 9], [7, 3, 9], [7, 3, 1e4]])
     assert rows(cut(cutting, x=x)) == [[0, 1], [3]] and cutting.tally.split_points == {"jump": 1}
 
 

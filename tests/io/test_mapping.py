@@ -16,7 +16,7 @@ from astra_data.io.mapping import ColumnMapping, ImportMapping, Jump, Split, rea
         (("fps", "fpx"), "fpx: unknown key: did you mean 'fps'"),
         (("fps = 10", "fps = 0"), "fps: expected"),
         (("clip", "clop"), "clop: unknown key"),
-        (("clip = [-1, 1]", "clip = [1, -1]"), "expected the lower bound first"),
+        (("clip = [-1, 1]", "clip = [1, 1]"), "expected the lower bound first"),
         (('names = ["x", "y"]', 'names = ["x", "x"]'), "names has x more than once"),
         (('role = ["position"]', 'role = ["place"]'), "unknown role place, expected position"),
         (("columns.gait", "columns.index"), "column index is filled in"),

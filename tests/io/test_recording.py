@@ -112,6 +112,7 @@ def test_small_recordings_may_unpack_to_what_is_small_and_others_to_a_multiple(t
     ):
         found = find_sources(paths, "npz", [".npz"], max_bytes=given)
         assert [source.most_bytes for source in found] == [most] * len(paths)
+        found[0].refuse_beyond(most)
 
 
 def test_capitals_hide_no_log(tmp_path: Path) -> None:

@@ -35,7 +35,7 @@ def test_a_doubled_field_in_csv_is_told(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("last", ["", "0.5"])
 def test_integers_that_floats_would_alter_are_told(tmp_path: Path, last: str) -> None:
-    stamps = np.array(["1700000000050000002"] * 19 + [last])
+    stamps = np.array(["-1700000000050000002"] * 19 + [last])
     path = write_table(tmp_path / "log.csv", rows() | {"stamp": stamps})
     told = r"numbers of 2\^53 or more came as floats" if not last else "expected whole numbers"
     with pytest.raises(BadInputError, match=f"gait: {told}"):
@@ -44,7 +44,7 @@ def test_integers_that_floats_would_alter_are_told(tmp_path: Path, last: str) ->
 
 
 def test_cells_are_numbers_flags_or_nothing(tmp_path: Path) -> None:
-    (tmp_path / "log.csv").write_text("whole,float,flag,gap\n9007199254740993,0.5,true,1\n-2,1e3,false,\n")
+    (tmp_path / "log.csv").write_text("whole,float,flag,gap\n9007199254740993,0.5,true,1\n-2,1e3,false,")
     columns = {name: {"fields": (name,)} for name in ("whole", "float", "flag", "gap")}
     mapping = ImportMapping.model_validate({"name": "n", "task": "t", "fps": 1, "columns": columns})
     source = Source(tmp_path / "log.csv", None, tmp_path / "log.csv")
@@ -138,13 +138,13 @@ def test_a_cut_off_line_begins_a_new_episode_where_files_go_on(tmp_path: Path) -
 
 
 def joined(folder: Path, prefix: str, *, lost: slice = slice(0)) -> None:
-    """Write states at 10 Hz and commands at 20 Hz, 0.32 s later and without those `lost`."""
+    """Write states at 10 Hz and commands at 20 Hz, 0.3 s later, one twice and without those `lost`; times in ms."""
     folder.mkdir(exist_ok=True)
-    states = "".join(f"{k / 10:.2f},{k},{-k}\n" for k in range(40))
-    commands = [f"{k / 20 + 0.32:.2f},{k}\n" for k in range(80)]
+    states = "".join(f"{100 * k},{k},{-k}\n" for k in range(40))
+    commands = [f"{50 * k + 300},{k}\n" for k in sorted([*range(80), 50])]
     del commands[lost]
     (folder / f"{prefix}state.csv").write_text(f"t,x,y\n{states}")
-    (folder / f"{prefix}control.csv").write_text("t,u\n" + "".join(commands))
+    (folder / f"{prefix}control_state.csv").write_text("t,u\n" + "".join(commands))
 
 
 JOINED = """
@@ -152,11 +152,12 @@ name = "log"
 task = "walk"
 fps = 10
 time = "t"
+time_scale = 0.001
 [columns."observation.state"]
 fields = ["state.csv:x", "state.csv:y"]
 names = ["x", "y"]
 [columns.action]
-fields = ["control.csv:u"]
+fields = ["control_state.csv:u"]
 [split]
 gap_s = 0.15
 """
@@ -167,30 +168,33 @@ def test_files_of_one_recording_are_joined_by_time(tmp_path: Path) -> None:
     joined(tmp_path / "logs/other", "", lost=slice(20, 30))
     dataset, _ = imported(tmp_path, tmp_path / "logs", JOINED)
     before, after, first = dataset.episodes()
-    # The first command comes at 0.32 s, so the first row is that at 0.4 s, with the command of 0.37 s.
-    assert first.columns["observation.state"][:2].tolist() == [[4, -4], [5, -5]]
-    assert first.columns["action"].tolist() == [1 + 2 * k for k in range(len(first))]
+    # The first command comes at 0.3 s, so the first row is that of the same time.
+    assert first.columns["observation.state"][:2].tolist() == [[3, -3], [4, -4]]
+    assert first.columns["action"].tolist() == [2 * k for k in range(len(first))]
     assert dataset.metadata["source"] == ["other/state.csv", "other/state.csv", "run1_state.csv"]
-    # Commands 20 to 29, of 1.32 to 1.77 s, are lost: 1.27 s holds until 1.4, and the next is of 1.82 s.
-    assert before.columns["observation.state"][[0, -1], 0].tolist() == [4, 13]
-    assert after.columns["observation.state"][0, 0] == 19 and after.columns["action"][:2].tolist() == [31, 33]
+    # Commands 20 to 29, of 1.3 to 1.75 s, are lost: 1.25 s holds until 1.4, and the next is of 1.8 s.
+    assert before.columns["observation.state"][[0, -1], 0].tolist() == [3, 13]
+    assert after.columns["observation.state"][0, 0] == 18 and after.columns["action"][:2].tolist() == [30, 32]
     assert len(dataset.description["config"]["recordings"]) == 4
 
 
 def test_files_that_cannot_be_joined_are_refused(tmp_path: Path) -> None:
-    joined(tmp_path / "logs", "")
+    joined(tmp_path / "logs", "", lost=slice(20, 30))
     for old, new, told in (
-        ('time = "t"\n', "", "files are joined by time: set `time`"),
-        ("control.csv:u", "u", r"u: expected the file of each field, such as state\.csv:x"),
-        ("control.csv:u", "wind.csv:u", r"wind\.csv is missing, which is joined with state\.csv"),
-        ("control.csv:u", "control.csv:v", r"control\.csv: no field 'v'"),
+        ('time = "t"\ntime_scale = 0.001\n', "", "files are joined by time: set `time`"),
+        ("control_state.csv:u", "u", r"u: expected the file of each field, such as state\.csv:x"),
+        ("control_state.csv:u", "wind.csv:u", r"wind\.csv is missing, which is joined with state\.csv"),
+        ("control_state.csv:u", "control_state.csv:v", r"control_state\.csv: no field 'v'"),
     ):
         mapping = JOINED.replace(old, new)
         with pytest.raises(BadInputError, match=told):
             imported(tmp_path / "x", tmp_path / "logs", mapping if new else mapping.replace("gap_s = 0.15\n", ""))
-    control = tmp_path / "logs/control.csv"
+    state, control = tmp_path / "logs/state.csv", tmp_path / "logs/control_state.csv"
+    state.write_text(state.read_text().replace("\n2000,20,", "\n2000,nan,"))
+    with pytest.raises(BadInputError, match=r"state\.csv:x in 1 row, state\.csv line 22"):
+        imported(tmp_path / "x", tmp_path / "logs", JOINED)
     control.write_text("t,u\n1.0,1\n0.5,2\n")
-    with pytest.raises(BadInputError, match=r"control\.csv: 't' goes back or is missing: sort"):
+    with pytest.raises(BadInputError, match=r"control_state\.csv: 't' goes back or is missing: sort"):
         imported(tmp_path / "x", tmp_path / "logs", JOINED)
 
 
