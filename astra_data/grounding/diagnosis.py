@@ -259,9 +259,10 @@ def _missed(log: _Log, pairing: Pairing) -> tuple[Missed, ...]:
 
 
 def _errors(log: _Log) -> Floats:
-    """Return the simulator's errors (N, X'), in the values in which it makes any."""
-    kept = log.error.std(axis=0) > 1e-6 * (np.abs(log.next_state - log.state).max(axis=0) + 1e-12)
-    return log.error[:, kept]
+    """Return the simulator's errors (N, X'), in the values in which it makes any after a history."""
+    error = log.error[log.step >= _PAST_STEPS]
+    moved = np.abs(log.next_state - log.state).max(axis=0) + 1e-12
+    return log.error[:, error.std(axis=0) > 1e-6 * moved] if len(error) else log.error[:, :0]
 
 
 def _histories(log: _Log) -> tuple[Floats, Floats]:
@@ -274,7 +275,7 @@ def _histories(log: _Log) -> tuple[Floats, Floats]:
 def _explained(log: _Log) -> dict[str, float]:
     """Return how much of the simulator's error is predicted from the present, the past, and all that is recorded."""
     error, aged = _errors(log), log.step >= _PAST_STEPS
-    if not error.size or not aged.any():
+    if not error.size:
         return {}
     present, history = _histories(log)
     sets = {

@@ -1,6 +1,7 @@
 """Run recipes: make every artifact that is not finished yet; `sweep.csv` has a line per finished evaluation."""
 
 import csv
+import logging
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import partial
@@ -49,6 +50,8 @@ COLUMNS = (
     *("method", "percent", "seed", "success", "steps", "return", "failed", "simulated_success"),
     *("dataset_version", "dataset_hash", "commit", "wall_seconds"),
 )
+
+_log = logging.getLogger(__name__)
 
 
 def run(
@@ -120,7 +123,12 @@ def write_diagnosis(experiment: Experiment, part: Selection) -> None:
     """Write the page of what the paired episodes of the first seed say before any fit, if there are any."""
     recipe, paired = experiment.recipe, experiment.folder / artifact_key("pair", "", part.seeds[0])
     if paired.is_dir():
-        page = diagnosis_page(experiment.path.stem, diagnose(paired, recipe.task), task_named(recipe.task).timestep_s)
+        try:
+            found = diagnose(paired, recipe.task)
+        except BadInputError as error:  # no reason to fail: the pairs are made
+            _log.warning("%s is not written: %s", DIAGNOSIS, error)
+            return
+        page = diagnosis_page(experiment.path.stem, found, task_named(recipe.task).timestep_s)
         write_file(experiment.folder / DIAGNOSIS, page)
 
 

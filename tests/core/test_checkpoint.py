@@ -69,7 +69,7 @@ def test_a_file_that_its_manifest_does_not_know_is_refused(tmp_path: Path) -> No
     with pytest.raises(BadInputError, match=r"policy\.safetensors was altered since it was made: restore"):
         load_tensors(path)
     (tmp_path / "manifest.json").write_text("{")
-    with pytest.raises(BadInputError, match=rf"^{tmp_path}: manifest\.json cannot be read"):
+    with pytest.raises(BadInputError, match=rf"^manifest\.json cannot be read in {tmp_path}"):
         load_tensors(path)
 
 
