@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike
 
 from astra_data.dataset.columns import ACTION, DONE, NEXT_STATE, REWARD, STATE, SUCCESS, TERMINATED, TRUNCATED, Array
 from astra_data.dataset.inspection import Endings
-from astra_data.io.cutting import Cutter
-from astra_data.io.mapping import ImportMapping
+from astra_data.io.cutting import Cutter, column_of
+from astra_data.io.mapping import ColumnMapping, ImportMapping
 from astra_data.io.recording import Block
 
 
@@ -239,6 +239,12 @@ def test_rows_without_a_value_of_the_field_are_one_episode_as_empty_cells_are() 
     made = cutter(split={"field": "trial"})
     assert rows(cut(made, x=np.arange(7), trial=field)) == [[0], [2, 3], [5]]
     assert made.tally.split_points == {"field": 2}
+
+
+def test_fields_of_which_values_are_taken_name_none_of_them() -> None:
+    for take, names in (((), ["x", "a"]), ((1, 0), None)):
+        found = column_of(STATE, ColumnMapping(fields=("x", "a"), take=take), 2).names
+        assert (found and list(found)) == names
 
 
 def test_columns_may_have_any_names() -> None:
