@@ -35,6 +35,8 @@ def test_the_careful_kicker_scores_from_every_start_of_its_simulator() -> None:
     world = SimulatorEnv(task.objective, EpisodeSimulator(task.simulator(100)))
     world.reset()
     act = careful(task, world.goal)
+    rolling, ahead = (torch.tensor([[0.0] * 4 + [x, 0.1, v, 0.0]]) for x, v in ((0.3, 0.4), (0.7, 0.0)))
+    torch.testing.assert_close(act(rolling, world.goal[:1]), act(ahead, world.goal[:1]))  # to where it will be
     scored, ended = torch.zeros(2, 100, dtype=torch.bool)
     for _ in range(task.objective.horizon):
         step = world.step(act(world.simulator.state, world.goal))
