@@ -22,7 +22,7 @@ from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.dataset import format as layout
 from astra_data.dataset.columns import Clip
 from astra_data.dataset.parquet import read_blocks
-from astra_data.dataset.plain import episodes_files, is_data_path, is_format_2, read_footer, read_places
+from astra_data.dataset.plain import episodes_files, is_data_path, is_format_2, read_footer, read_object, read_places
 
 MOST_EXTRA_S = 1.0
 _ENCODERS = {"av1": "libsvtav1", "h264": "libx264", "hevc": "libx265"}
@@ -115,14 +115,10 @@ def _index(path: Path, digest: str | None, _changed_ns: int) -> _Index:
     return found
 
 
-def read_cameras(
-    root: Path, info: Mapping[str, Any], digests: Mapping[str, str]
-) -> tuple[dict[str, Camera], dict[str, str]]:
-    """Return the cameras of the LeRobot dataset in `root`, and what is wrong with those that cannot be read.
-
-    `digests` are the known ones of its video files, by their paths in `root`.
-    """
-    cameras, faults = dict[str, Camera](), dict[str, str]()
+def read_cameras(root: Path, info: Mapping[str, Any]) -> tuple[dict[str, Camera], dict[str, str]]:
+    """Return the cameras of the LeRobot dataset in `root`, and what is wrong with those that cannot be read."""
+    cameras, faults, described = dict[str, Camera](), dict[str, str](), read_object(root / layout.DATASET_PATH)
+    digests = {} if isinstance(described, str) else described.get("videos", {})
     features = info["features"] if isinstance(info.get("features"), Mapping) else {}
     for name, feature in features.items():
         if isinstance(feature, Mapping) and (kind := feature.get("dtype")) in ("video", "image"):
@@ -135,7 +131,7 @@ def read_cameras(
                     raise ValueError(f"{len(found)} episodes, expected {info['total_episodes']}")
                 if gone := sorted({str(clip.path.relative_to(root)) for clip in found if not clip.path.is_file()}):
                     faults[name] = f"{', '.join(gone[:3])}{' and others' * (len(gone) > 3)} missing"
-            except (CorruptDatasetError, KeyError, IndexError, TypeError, ValueError) as error:
+            except (CorruptDatasetError, AttributeError, LookupError, TypeError, ValueError) as error:
                 faults[name] = f"its places in meta/episodes cannot be read ({error})"
     return {name: camera for name, camera in cameras.items() if name not in faults}, faults
 
@@ -147,8 +143,8 @@ def _rows(root: Path, names: Sequence[str], camera: str) -> Iterator[dict[str, A
 
 
 def _statistics(row: Mapping[str, Any], camera: str) -> dict[str, Any]:
-    found = {key: row.get(f"stats/{camera}/{key}") for key in layout.STORED_STATISTICS}
-    return {key: value for key, value in found.items() if value is not None}
+    names = {key: f"stats/{camera}/{key}" for key in layout.STORED_STATISTICS}
+    return {key: row[name] for key, name in names.items() if row.get(name) is not None}
 
 
 def _of_video(root: Path, info: Mapping[str, Any], name: str) -> Iterator[Clip]:
@@ -213,15 +209,11 @@ def images(clip: Clip) -> list[dict[str, Any]]:
 def decoded(clip: Clip) -> NDArray[Any]:
     """Return the pictures of a clip, (T, H, W, 3) uint8; those of a depth camera are (T, H, W) uint16."""
     if clip.path.suffix == ".mp4":
-        return np.stack([_array(frame) for frame in _decode(clip)])
+        kinds = {"gray10le": "gray16le", "gray12le": "gray16le", "gray16le": "gray16le"}  # of depth cameras
+        return np.stack([frame.to_ndarray(format=kinds.get(frame.format.name, "rgb24")) for frame in _decode(clip)])
     from PIL import Image  # noqa: PLC0415 - slow
 
     return np.stack([np.asarray(Image.open(io.BytesIO(one["bytes"]))) for one in images(clip)])
-
-
-def _array(frame: Any) -> NDArray[Any]:  # noqa: ANN401 - of PyAV
-    is_depth = str(frame.format.name).startswith("gray1")
-    return np.asarray(frame.to_ndarray(format="gray16le" if is_depth else "rgb24"))
 
 
 def _decode(clip: Clip) -> Iterator[Any]:

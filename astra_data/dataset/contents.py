@@ -68,7 +68,7 @@ def _parsed(root: Path, description: dict[str, Any]) -> Contents:
     )
     if not plain.is_data_path(info["data_path"]):
         raise BadInputError(f"expected a path inside the dataset's folder, got {info['data_path']!r}")
-    cameras, faults_of = read_cameras(root, info, description.get("videos", {}))
+    cameras, faults_of = read_cameras(root, info)
     info["features"] = {name: it for name, it in info["features"].items() if name not in {*cameras, *faults_of}}
     columns = [Column.from_feature(name, feature) for name, feature in info["features"].items()]
     tables = pa.concat_tables(read_blocks(plain.episodes_files(root), _LOCATION))

@@ -58,7 +58,7 @@ def open_recording(root: Path) -> Contents:
     kept = [episode for episode in episodes if episode.steps]
     if not kept:
         raise BadInputError(f"{root}, recorded by LeRobot, has no episode of two rows or more")
-    cameras, unread = read_cameras(root, info, {})
+    cameras, unread = read_cameras(root, info)
     others = sorted(info["features"].keys() - {*(spec.name for spec in specs), *names.RESERVED, *cameras, *unread})
     _announce(root, rows, columns, episodes, others, roundings.found(), unread)
     uids, lengths = [episode.uid for episode in kept], np.array([episode.steps for episode in kept])

@@ -17,7 +17,6 @@ from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import next_version
 
 _COMPARED = {"<=": "less_equal", ">=": "greater_equal", "==": "equal", "!=": "not_equal", "<": "less", ">": "greater"}
-"""Comparisons, and NumPy's functions of them."""
 _CONDITION = re.compile(r"\s*(.+?)\s*(<=|>=|==|!=|<|>)\s*(\S+)\s*")
 _OBSERVED = re.compile(r"(next\.)?observation\.")
 _TURNS = {"rad": 2 * np.pi, "deg": 360.0}
@@ -59,10 +58,9 @@ def trim(
     def kept(episode: Episode) -> Bools:
         left = np.zeros(len(episode), bool)
         left[first : len(episode) - last] = True
-        if still and (moving := np.flatnonzero(left & _moves(episode))).size:
-            left[: moving[0]] = left[moving[-1] + 1 :] = False
-        elif still:
-            left[:] = False
+        if still:
+            moving = np.flatnonzero(left & _moves(episode))
+            left[: moving[0] if moving.size else None] = left[moving[-1] + 1 if moving.size else 0 :] = False
         return left & ~condition(episode) if condition else left
 
     known = set(source.uids.tolist())
@@ -95,24 +93,12 @@ def resample(source: Dataset, fps: int, *, name: str | None = None, out: Path | 
     return _write(source, schema, slower, fps, stage="resample", config=config, name=name, out=out)
 
 
-def _write(
-    source: Dataset,
-    schema: list[Column],
-    episodes: Iterator[Episode],
-    fps: int,
-    *,
-    stage: str,
-    config: Mapping[str, Any],
-    name: str | None,
-    out: Path | None,
-) -> Path:
-    with next_version(
-        source, "columns", stage=stage, config=config, name=name, out=out, fps=fps, schema=schema
-    ) as writer:
+def _write(source: Dataset, schema: list[Column], episodes: Iterator[Episode], fps: int, **described: Any) -> Path:
+    """Write the episodes as the next version, `described` as `next_version` takes it."""
+    with next_version(source, "columns", fps=fps, schema=schema, **described) as writer:
         count = 0
-        for episode in episodes:
+        for count, episode in enumerate(episodes, start=1):  # noqa: B007
             writer.add(episode)
-            count += 1
         if not count:
             raise BadInputError(f"{source.reference}: nothing of its {len(source)} episodes would be left")
     return writer.root
@@ -195,11 +181,7 @@ def _resampled(episode: Episode, schema: Sequence[Column], before: int, fps: int
         elif column.name in (names.TERMINATED, names.TRUNCATED, names.DONE, names.SUCCESS):
             counts = np.concatenate([[0], np.cumsum(values)])
             found = np.diff(counts[[*row[:-1], len(episode)]]) > 0
-        elif (
-            column.dtype == "float32"
-            and column.name.removeprefix("next.").startswith("observation.")
-            and column.name != names.GOAL
-        ):
+        elif column.dtype == "float32" and _OBSERVED.match(column.name) and column.name != names.GOAL:
             of = episode.columns[names.STATE] if column.name == names.NEXT_STATE else values
             if has_next and column.name in (names.STATE, names.NEXT_STATE):
                 of = np.concatenate([of, episode.columns[names.NEXT_STATE][-1:]])

@@ -97,9 +97,7 @@ def check(root: Path) -> Report:
             EpisodeChecks(root, info, columns, digests, report).run()
         except AstraDataError as error:
             report.fault("values", str(error))
-    described = plain.read_object(root / layout.DATASET_PATH)
-    digests_of = described.get("videos", {}) if isinstance(described, dict) else {}
-    cameras, unread = read_cameras(root, info, digests_of)
+    cameras, unread = read_cameras(root, info)
     for name, fault in unread.items():
         report.fault("cameras", f"{name}: {fault}")
     for name, camera in cameras.items():

@@ -226,8 +226,7 @@ def remains_of(folder: Path, sources: Sequence[Dataset], notes: list[str]) -> Re
         specs = lerobot_rows.our_columns(specs, has_tasks=not isinstance(tasks, str) and len(tasks) > 1)
     if is_format_2(folder):
         notes.append(f"LeRobot's format {info['codebase_version']} became {layout.CODEBASE_VERSION}")
-    described = read_object(folder / layout.DATASET_PATH)
-    cameras, unread = read_cameras(folder, info, {} if isinstance(described, str) else described.get("videos", {}))
+    cameras, unread = read_cameras(folder, info)
     for name, fault in unread.items():
         notes.append(f"{name} is left out: {fault}")
     for name in [name for name, camera in cameras.items() if all(map(clip_fault, camera.clips))]:
