@@ -109,7 +109,7 @@ def _condition(source: Dataset, text: str) -> Any:  # noqa: ANN401 - episode to 
     parts = _CONDITION.fullmatch(text)
     known = {
         label: (column, index)
-        for column in source.schema
+        for column in reversed(source.schema)  # of names that several have, the first
         for index, value in enumerate(column.labels)
         for label in ([column.name] if column.size == 1 else [value, f"{column.name}.{value}"])
     }

@@ -152,3 +152,11 @@ def test_without_next_states_the_last_state_has_no_step_after_it(tmp_path: Path)
 def test_another_rate_is_one(source: Dataset, tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="expected another rate than 20 per second"):
         resample(source, 20, out=tmp_path / "out")
+
+
+def test_a_name_that_several_columns_have_means_the_first(source: Dataset, tmp_path: Path) -> None:
+    found = made(trim(source, without="x > 0", out=tmp_path / "out"))
+    assert all((one.columns[STATE][:, 0] <= 0).all() for one in found)
+    assert sum(map(len, found)) == sum(int((one.columns[STATE][:, 0] <= 0).sum()) for one in source.episodes())
+    found = made(trim(source, without="action.x > 0", out=tmp_path / "action"))
+    assert all((one.columns[ACTION][:, 0] <= 0).all() for one in found)
