@@ -237,11 +237,6 @@ class Episode:
         if faults:
             raise BadInputError(f"Episode {self.uid}: {'; '.join(faults)}.")
 
-    def part(self, first: int, end: int) -> tuple[dict[str, Array], dict[str, Clip]]:
-        """Return the columns and cameras of the steps `first` to `end`, exclusive."""
-        columns = {name: values[first:end].copy() for name, values in self.columns.items()}
-        return columns, {name: clip.part(first, end) for name, clip in self.cameras.items()}
-
     def __len__(self) -> int:
         """Return T."""
         return len(next(iter(self.columns.values())))

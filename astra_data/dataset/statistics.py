@@ -93,14 +93,20 @@ class EpisodeRows:
 
     def __init__(self, root: Path, columns: list[Column], task: str, cameras: Mapping[str, Mapping[str, Any]]) -> None:
         self._columns, self._task, self._schema = columns, task, episodes_schema(columns, cameras)
-        self.pictures: list[Mapping[str, Any]] = []  # places and statistics of the cameras, of each episode
+        self.pictures: list[Mapping[str, Any]] = []
         self._writer = RotatingWriter(root, EPISODES_PATH, self._schema)
         self._rows: list[tuple[int, int, int]] = []
         self._statistics: list[NDArray[np.float64]] = []
         self._episodes = self._frames = 0
 
-    def append(self, length: int, chunk: int, file: int, statistics: NDArray[np.float64]) -> None:
-        """Append an episode of `length` steps in data file `file` of `chunk`; `statistics` (9, sum of sizes)."""
+    def append(
+        self, length: int, chunk: int, file: int, statistics: NDArray[np.float64], pictures: Mapping[str, Any]
+    ) -> None:
+        """Append an episode of `length` steps in data file `file` of `chunk`; `statistics` (9, sum of sizes).
+
+        `pictures` are the places and statistics of its cameras, by the columns' names.
+        """
+        self.pictures.append(pictures)
         self._rows.append((length, chunk, file))
         self._statistics.append(statistics)
         if len(self._rows) == ROWS_AT_ONCE:

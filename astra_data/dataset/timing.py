@@ -1,8 +1,9 @@
 """New versions of a dataset with other steps: trimmed, without some steps, or at another rate."""
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from operator import eq, ge, gt, le, lt, ne
 from pathlib import Path
 from typing import Any
 
@@ -12,14 +13,14 @@ from astra_data.core.arrays import Bools, Floats, as_rows
 from astra_data.core.config import did_you_mean
 from astra_data.core.errors import BadInputError
 from astra_data.dataset import columns as names
+from astra_data.dataset.checkup import TURNS
 from astra_data.dataset.columns import Array, Column, Episode, new_uid
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import next_version
 
-_COMPARED = {"<=": "less_equal", ">=": "greater_equal", "==": "equal", "!=": "not_equal", "<": "less", ">": "greater"}
+_COMPARED = {"<=": le, ">=": ge, "==": eq, "!=": ne, "<": lt, ">": gt}
 _CONDITION = re.compile(r"\s*(.+?)\s*(<=|>=|==|!=|<|>)\s*(\S+)\s*")
 _OBSERVED = re.compile(r"(next\.)?observation\.")
-_TURNS = {"rad": 2 * np.pi, "deg": 360.0}
 
 
 def trim(
@@ -104,7 +105,7 @@ def _write(source: Dataset, schema: list[Column], episodes: Iterator[Episode], f
     return writer.root
 
 
-def _condition(source: Dataset, text: str) -> Any:  # noqa: ANN401 - episode to (T,) bool
+def _condition(source: Dataset, text: str) -> Callable[[Episode], Bools]:
     """Return a function that says in which steps of an episode "NAME < NUMBER" holds."""
     parts = _CONDITION.fullmatch(text)
     known = {
@@ -125,7 +126,7 @@ def _condition(source: Dataset, text: str) -> Any:  # noqa: ANN401 - episode to 
     if value not in known:
         raise BadInputError(f"{source.reference} has no value {value!r}{did_you_mean(value, known)}")
     column, index = known[value]
-    compare = getattr(np, _COMPARED[compared])
+    compare = _COMPARED[compared]
     return lambda episode: compare(as_rows(episode.columns[column.name])[:, index].astype(np.float64), limit)
 
 
@@ -142,7 +143,8 @@ def _pieces(episode: Episode, kept: Bools, source: Dataset, known: set[int]) -> 
         if (first, end) == (0, len(episode)):
             yield episode
             return
-        columns, cameras = episode.part(first, end)
+        columns = {name: values[first:end].copy() for name, values in episode.columns.items()}
+        cameras = {name: clip.part(first, end) for name, clip in episode.cameras.items()}
         if end < len(episode):
             for name in {names.TRUNCATED, names.DONE} & columns.keys():
                 columns[name][-1] = True
@@ -198,7 +200,7 @@ def _interpolated(values: Floats, at: Floats, column: Column) -> Floats:
     """Return rows of `values` (N, D) `at` places between 0 and N - 1, (M, D)."""
     recorded = values
     values = values.copy()
-    turns = {index: _TURNS[unit] for index, unit in enumerate(column.units) if unit in _TURNS}
+    turns = {index: TURNS[unit] for index, unit in enumerate(column.units) if unit in TURNS}
     for index, turn in turns.items():
         values[:, index] = np.unwrap(values[:, index], period=turn)
     low = np.minimum(at.astype(int), len(values) - 1)

@@ -189,8 +189,7 @@ class DatasetWriter:
         for name, column in values.items():
             self._hash.update(name, column)
             self._digests[name].append(digest_of(column))
-        self._rows.pictures.append(pictures)
-        self._rows.append(length, chunk, file, episode_statistics(values.values()))
+        self._rows.append(length, chunk, file, episode_statistics(values.values()), pictures)
         self._frames += length
         self._lengths[episode.uid] = length
         self._metadata.append(episode.metadata)

@@ -16,6 +16,7 @@ from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import open_dataset
 from astra_data.robots.registry import Pairing, built, pairing_named
 from astra_data.worlds.commands import Commands
+from astra_data.worlds.protocols import AbstractSimulator
 
 LONGEST_S, LONGEST_STEPS = 2.0, 20  # longest delay that is looked for: the shorter of the two
 FEWEST = 8  # recordings from which on a forecast is made
@@ -108,13 +109,16 @@ def diagnose(dataset: str | Path, simulator: str) -> Diagnosis:
     bounds = pairing.commands or Commands.recorded(dataset)
     responses, best_shift = _responses(log, pairing, names, source.info["fps"])
     missed = _missed(log, pairing)
-    explained = _explained(log)
-    forecast = _forecast(log) if explained and log.recording.max() + 1 >= FEWEST else None
+    error, aged = _errors(log), log.step >= _PAST_STEPS
+    present, history = _histories(log, error)
+    explained = _explained(log, error, aged, present, history) if error.size else {}
+    may_forecast = error.size and log.recording.max() + 1 >= FEWEST
+    forecast = _forecast(history[aged], error[aged], log.recording[aged]) if may_forecast else None
     findings = (
         *_of_responses(responses, source.info["fps"]),
         *_of_hidden_state(explained),
         *_of_commands(log, names, bounds),
-        *_of_rates(source, source.info["fps"]),
+        *_of_rates(log, source.info["fps"]),
         *_of_failures(source, log),
         *_of_forecast(forecast, missed),
     )
@@ -167,8 +171,8 @@ def _responses(log: _Log, pairing: Pairing, names: Sequence[str], fps: float) ->
     count = max(1, _SIMULATED // (size * (lags + 1)))
     if len(rows) > count:
         rows = np.sort(np.random.default_rng(0).choice(rows, count, replace=False))
-    middle = log.action[rows].mean(axis=0)
-    alone = _moves(pairing, log.state[rows], np.broadcast_to(middle, (len(rows), size)))
+    middle, simulators = log.action[rows].mean(axis=0), built(pairing, len(rows))
+    alone = _moved(simulators, log.state[rows], np.broadcast_to(middle, (len(rows), size)))
     moved = log.next_state[rows] - alone
     scale = moved.std(axis=0)
     used = scale > 1e-9 * max(1.0, float(np.abs(log.state).max()))
@@ -176,12 +180,12 @@ def _responses(log: _Log, pairing: Pairing, names: Sequence[str], fps: float) ->
     features = np.empty((len(rows), size * (lags + 1), int(used.sum())))
     for lag in range(lags + 1):
         past = log.action[rows - lag]
-        apart = (_moves(pairing, log.state[rows], past) - log.next_state[rows]) / scale
+        apart = (_moved(simulators, log.state[rows], past) - log.next_state[rows]) / scale
         errors.append(float((apart[:, used] ** 2).mean()) if used.any() else 0.0)
         for axis in range(size):
             one = np.tile(middle, (len(rows), 1))
             one[:, axis] = past[:, axis]
-            felt = (_moves(pairing, log.state[rows], one) - alone) / scale
+            felt = (_moved(simulators, log.state[rows], one) - alone) / scale
             features[:, axis * (lags + 1) + lag] = felt[:, used]
     weights = _refitted(features, (moved / scale)[:, used], log.recording[rows], size).reshape(-1, size, lags + 1)
     found = []
@@ -192,11 +196,10 @@ def _responses(log: _Log, pairing: Pairing, names: Sequence[str], fps: float) ->
     return tuple(found), int(np.argmin(errors))
 
 
-def _moves(pairing: Pairing, state: Floats, action: Floats) -> Floats:
-    """Return where simulators that are set to `state` (N, X) land with `action` (N, A)."""
-    batch = built(pairing, len(state))
-    batch.reset_to(torch.from_numpy(state.astype(np.float32)))
-    return np.asarray(batch.step(torch.from_numpy(np.ascontiguousarray(action, np.float32))), np.float64)
+def _moved(simulators: AbstractSimulator, state: Floats, action: Floats) -> Floats:
+    """Return where N simulators that are set to `state` (N, X) land with `action` (N, A)."""
+    simulators.reset_to(torch.from_numpy(state.astype(np.float32)))
+    return np.asarray(simulators.step(torch.from_numpy(np.ascontiguousarray(action, np.float32))), np.float64)
 
 
 def _refitted(features: Floats, moved: Floats, recording: Ints, axes: int) -> Floats:
@@ -265,19 +268,15 @@ def _errors(log: _Log) -> Floats:
     return log.error[:, error.std(axis=0) > 1e-6 * moved] if len(error) else log.error[:, :0]
 
 
-def _histories(log: _Log) -> tuple[Floats, Floats]:
+def _histories(log: _Log, error: Floats) -> tuple[Floats, Floats]:
     """Return features of the present, (N, D), a constant among them, and those with the past steps as well."""
-    error, present = _errors(log), _products(np.concatenate([log.state, log.action], axis=1))
+    present = _products(np.concatenate([log.state, log.action], axis=1))
     past = [log.before(values, steps) for steps in range(1, _PAST_STEPS + 1) for values in (error, log.action)]
     return present, np.concatenate([present, *past], axis=1)
 
 
-def _explained(log: _Log) -> dict[str, float]:
+def _explained(log: _Log, error: Floats, aged: Bools, present: Floats, history: Floats) -> dict[str, float]:
     """Return how much of the simulator's error is predicted from the present, the past, and all that is recorded."""
-    error, aged = _errors(log), log.step >= _PAST_STEPS
-    if not error.size:
-        return {}
-    present, history = _histories(log)
     sets = {
         "the present abstract state and command": present,
         f"a history of {_PAST_STEPS} steps": history,
@@ -310,9 +309,7 @@ def _ridge(features: Floats, error: Floats) -> Floats:
     return np.asarray(np.linalg.solve(square + ridge, features.T @ error))
 
 
-def _forecast(log: _Log) -> Forecast:
-    aged = log.step >= _PAST_STEPS
-    features, error, recording = _histories(log)[1][aged], _errors(log)[aged], log.recording[aged]
+def _forecast(features: Floats, error: Floats, recording: Ints) -> Forecast:
     error = error / error.std(axis=0)
     known, rng = np.unique(recording), np.random.default_rng(0)
     fitted = len(known) - max(1, len(known) // 5)
@@ -399,9 +396,9 @@ def _of_commands(log: _Log, names: Sequence[str], bounds: Commands) -> Iterator[
         yield Finding("warning", f"{together} only ever vary together", "vary them one at a time: their effects mix")
 
 
-def _of_rates(source: Dataset, fps: float) -> Iterator[Finding]:
+def _of_rates(log: _Log, fps: float) -> Iterator[Finding]:
     """Yield a warning if the state is repeated from step to step: it comes at a lower rate."""
-    values = as_rows(source.columns([keys.STATE])[keys.STATE])
+    values = log.target_state
     rate = fps * float((values[1:] != values[:-1]).any(axis=1).mean()) if len(values) > 1 else fps
     if rate < 0.8 * fps:
         yield Finding(

@@ -103,7 +103,9 @@ def test_rows_locate_the_episodes_and_hold_their_statistics(
     data = [(rng.normal(size=(length, 2)).astype(np.float32), rng.random(length) < 0.5) for length in LENGTHS]
     writer = EpisodeRows(tmp_path, COLUMNS, "walk", {})
     for number, episode in enumerate(data):
-        writer.append(len(episode[0]), chunk=number, file=10 + number, statistics=episode_statistics(episode))
+        writer.append(
+            len(episode[0]), chunk=number, file=10 + number, statistics=episode_statistics(episode), pictures={}
+        )
     writer.close()
     path = tmp_path / "meta/episodes/chunk-000/file-000.parquet"
     # No more rows than that are held in memory.

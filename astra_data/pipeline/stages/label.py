@@ -139,7 +139,7 @@ def with_outcomes(task: Task, episode: Episode, seed: int) -> Episode:
     columns |= {names.REWARD: reward.astype(np.float32), names.SUCCESS: success.numpy(), **given}
     columns |= {names.TERMINATED: terminated, names.TRUNCATED: truncated, names.DONE: terminated | truncated}
     kept = {key: values[:length] for key, values in columns.items()}
-    cameras = episode.part(0, length)[1]
+    cameras = {name: clip.part(0, length) for name, clip in episode.cameras.items()}
     return Episode(episode.uid, kept, dict(episode.metadata) | outcome_of(kept), cameras)
 
 
