@@ -159,13 +159,12 @@ def is_terminated(columns: Mapping[str, Array]) -> bool:
 
 
 def outcome_of(columns: Mapping[str, Array]) -> dict[str, bool | float]:
-    """Return what the metadata of an episode with these columns say of its outcome."""
-    success = bool(columns[SUCCESS].any())
-    return {
-        "success": success,
-        "failed": is_terminated(columns) and not success,
-        "return": float(columns[REWARD].sum(dtype=np.float64)),
-    }
+    """Return what the metadata of an episode with these columns say of its outcome, as far as the columns do."""
+    found: dict[str, bool | float] = {}
+    if SUCCESS in columns:
+        success = bool(columns[SUCCESS].any())
+        found |= {"success": success, "failed": is_terminated(columns) and not success}
+    return found | ({"return": float(columns[REWARD].sum(dtype=np.float64))} if REWARD in columns else {})
 
 
 def stands_still(state: Array, next_state: Array) -> bool:

@@ -15,6 +15,7 @@ from astra_data.core.errors import BadInputError
 from astra_data.dataset import columns as names
 from astra_data.dataset.checkup import TURNS
 from astra_data.dataset.columns import Array, Column, Episode, new_uid
+from astra_data.dataset.inspection import outcome_of
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import next_version
 
@@ -157,13 +158,8 @@ def _pieces(episode: Episode, kept: Bools, source: Dataset, known: set[int]) -> 
 
 
 def _facts(columns: Mapping[str, Array], metadata: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the metadata, with return and success of the steps that are left."""
-    changed = dict(metadata)
-    if "return" in changed and names.REWARD in columns:
-        changed["return"] = float(columns[names.REWARD].sum(dtype=np.float64))
-    if "success" in changed and names.SUCCESS in columns:
-        changed["success"] = bool(columns[names.SUCCESS].any())
-    return changed
+    """Return the metadata, with what they say of the outcome as the steps that are left have it."""
+    return {**metadata, **{key: value for key, value in outcome_of(columns).items() if key in metadata}}
 
 
 def _resampled(episode: Episode, schema: Sequence[Column], before: int, fps: int) -> Episode | None:

@@ -1,8 +1,9 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from fake_dataset import LENGTHS, write_fake, writer
+from fake_dataset import LENGTHS, fake_episode, write_fake, writer
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import (
@@ -42,6 +43,17 @@ def test_time_goes_from_both_ends_and_what_lost_its_end_is_truncated(source: Dat
         assert one.columns[TRUNCATED].tolist() == one.columns[DONE].tolist() == [*[False] * (len(one) - 1), True]
         assert not one.columns[TERMINATED].any() and one.metadata["success"] is False
         assert one.metadata["return"] == pytest.approx(whole[REWARD][2:-4].sum(), rel=1e-5)
+
+
+def test_an_episode_that_lost_its_failure_has_not_failed(tmp_path: Path) -> None:
+    episode = fake_episode(1, 9)
+    columns = {**episode.columns, SUCCESS: np.zeros(9, bool)}
+    with writer(tmp_path / "failed") as opened:
+        opened.add(replace(episode, columns=columns, metadata={"failed": True, "success": False}))
+    failed = Dataset.open(tmp_path / "failed")
+    for start_s, end_s, expected in (0.1, 0.0, True), (0.0, 0.1, False):
+        [one] = made(trim(failed, start_s=start_s, end_s=end_s, out=tmp_path / str(expected)))
+        assert one.metadata == {"failed": expected, "success": False}
 
 
 def test_an_episode_that_loses_nothing_stays_as_it_is(source: Dataset, tmp_path: Path) -> None:
