@@ -4,8 +4,8 @@ import mujoco
 import numpy as np
 
 from astra_data.core.arrays import Floats
-from astra_data.robots.nao.perception import PerceptionErrors
 from astra_data.robots.nao.robot import nao_model
+from astra_data.robots.nao.tasks import PerceptionErrors
 from astra_data.robots.nao.walk import FOOT_HEIGHT_M, TO_MOTORS
 
 NO_ERRORS = PerceptionErrors(*(0.0,) * 3, 2.0, 0.0, (0.0, 0.0), *(0.0,) * 4, 0.5, 0.0, np.pi, 0.0)

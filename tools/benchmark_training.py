@@ -30,8 +30,8 @@ from astra_data.core.provenance import cores
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.model import GroundingModel, GroundingShape
 from astra_data.grounding.simulator import NO_GROUNDING, Grounding
+from astra_data.methods.iql import Experience, Iql, IqlConfig
 from astra_data.pipeline.recipe import Recipe
-from astra_data.policies.iql import Experience, Iql, IqlConfig
 from astra_data.policies.networks import ActorCritic, ActorCriticShape
 from astra_data.policies.ppo import Ppo
 from astra_data.policies.simulator_env import SimulatorEnv

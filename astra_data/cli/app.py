@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 from typer.core import TyperArgument, TyperOption
 
-from astra_data.cli import building, datasets, recipes, sharing, starting
+from astra_data.cli import datasets, recipes, sharing, starting
 from astra_data.core.durable import NO_FSYNC, disk_error
 from astra_data.core.errors import AstraDataError, missing_extra
 from astra_data.core.naming import in_lines
@@ -68,13 +68,13 @@ PANELS: dict[str, dict[str, Callable[..., None]]] = {
         "view runs/quickstart --save run.rrd": recipes.view,
     },
     "Recipes or datasets": {
-        "collect antmaze-umaze --episodes 50 --name walks": building.collect,
-        "pair walks --simulator antmaze-umaze": building.pair,
+        "collect antmaze-umaze --episodes 50 --name walks": recipes.collect,
+        "pair walks --simulator antmaze-umaze": recipes.pair,
         "subset walks --percent 50 --name half": datasets.subset,
     },
     "Datasets": {
-        "label logs --task cart.py:TASK": building.label,
-        "augment walks --copies 3 --rotations quarter": building.augment,
+        "label logs --task cart.py:TASK": recipes.label,
+        "augment walks --copies 3 --rotations quarter": recipes.augment,
         "merge walks more --name all": datasets.merge,
         "filter walks --success": datasets.filter_,
         "trim logs --start 2 --without 'v < 0.05'": datasets.trim,

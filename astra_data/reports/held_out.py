@@ -54,7 +54,7 @@ def write_held_out(
     figures = {}
     if rates := results.failure_rates():
         from astra_data.reports.figures.catalog import pictures
-        from astra_data.reports.figures.errors import reliability
+        from astra_data.reports.figures.charts import reliability
         from astra_data.reports.figures.style import png
 
         write_file(root / RELIABILITY, png(reliability(rates)))

@@ -13,8 +13,7 @@ from astra_data.core.progress import Progress, silent
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.simulator import NO_GROUNDING
 from astra_data.methods import METHODS, iql
-from astra_data.methods.iql import clone_behavior, experience_of, learn_from_episodes
-from astra_data.policies.iql import Iql, IqlConfig
+from astra_data.methods.iql import Iql, IqlConfig, clone_behavior, experience_of, learn_from_episodes
 from astra_data.policies.networks import ActorCritic, ActorCriticShape
 from astra_data.policies.running_policy import PolicyFile
 from astra_data.policies.train import PpoTrainConfig, Training
@@ -113,7 +112,7 @@ def test_fine_tuning_takes_fewer_and_smaller_updates_of_the_given_policy(
 def test_cloning_does_what_was_recorded_whatever_it_paid(
     learn: Learn, episodes: PairedEpisodes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("astra_data.policies.iql._CRITIC_LEARNING_RATE", 1e-2)
+    monkeypatch.setattr("astra_data.methods.iql._CRITIC_LEARNING_RATE", 1e-2)
     # Going right pays, going left does not; both were recorded, left three times as often.
     rightwards = torch.rand(6, STEPS) < 0.25
     episodes.windows.action.copy_(torch.where(rightwards, 0.8, -0.8).unsqueeze(-1).expand(-1, -1, 2))

@@ -7,10 +7,10 @@ import pytest
 
 from astra_data.core.config import Config, validated
 from astra_data.core.errors import BadInputError, RecipeError
+from astra_data.methods.iql import IqlConfig
 from astra_data.methods.method import Table
 from astra_data.pipeline.recipe import Recipe, read_tables, recorded_settings, with_tables
 from astra_data.pipeline.stages.registry import STAGES
-from astra_data.policies.iql import IqlConfig
 from astra_data.policies.train import PpoTrainConfig, SacTrainConfig, TargetConfig
 
 BASE = {"task": "humanoid-walker2d", "methods": ["direct_transfer"], "seeds": [0]}

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from astra_data.core.errors import BadInputError
-from astra_data.reports.figures.errors import reliability
+from astra_data.reports.figures.charts import reliability
 from astra_data.reports.held_out import write_held_out
 
 Rates = Mapping[str, Mapping[str, NDArray[np.float64]]]
@@ -159,7 +159,7 @@ def test_the_figure_pools_the_steps_of_all_seeds_by_bin(tmp_path: Path, monkeypa
         shown.append(parts)
         return reliability(parts)
 
-    monkeypatch.setattr("astra_data.reports.figures.errors.reliability", noted)
+    monkeypatch.setattr("astra_data.reports.figures.charts.reliability", noted)
     for percent, seed in ((100, 0), (100, 1), (25, 0)):
         write(tmp_path, percent, seed, 0.1)
     write_failures(tmp_path, 0, 1.0)

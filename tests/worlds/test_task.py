@@ -9,7 +9,7 @@ from small_cart import GIVEN, LOGS_ALONE, TASK, Rail, Reach
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import Column
 from astra_data.methods.follower import careful
-from astra_data.policies.collecting import WallWatch
+from astra_data.pipeline.stages.collect import WallWatch
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.commands import DrivenSimulator
 from astra_data.worlds.plane.mazes import U_MAZE

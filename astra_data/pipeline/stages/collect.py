@@ -1,36 +1,300 @@
 """Collect: record a behavior in the target environment as a LeRobot dataset."""
 
 import time
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import Field, model_validator
+import torch
+from numpy.typing import NDArray
+from pydantic import AfterValidator, Field, model_validator
+from torch import Tensor
 
-from astra_data.core.config import Config, Count, NotNegative, Share
+from astra_data.core.arrays import as_column
+from astra_data.core.checkpoint import Logbook
+from astra_data.core.config import Config, Count, NotNegative, Share, in_order
 from astra_data.core.durable import file_digest
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, Stopwatch, part, silent
-from astra_data.core.seeding import derive
-from astra_data.dataset.columns import OUTCOME_COLUMNS
+from astra_data.core.seeding import derive, generator
+from astra_data.dataset import columns as names
+from astra_data.dataset.columns import OUTCOME_COLUMNS, Array, Episode
+from astra_data.dataset.inspection import outcome_of
 from astra_data.dataset.staging import StagedWriter
 from astra_data.dataset.versions import home_of
 from astra_data.grounding.files import GROUNDING, TARGET_ENCODER, grounding_at, load_target_encoder
-from astra_data.policies.collecting import (
-    Behavior,
-    HoldTimes,
-    MixedBehavior,
-    PolicyBehavior,
-    RandomCommands,
-    StressCommands,
-    WallWatch,
-    held_steps,
-    record,
-)
-from astra_data.policies.running_policy import POLICY, PolicyFile, running
+from astra_data.policies.episodes import ObservedTargetEnv
+from astra_data.policies.networks import ActorCritic, ActorCriticShape, PolicyShape, SoftActor
+from astra_data.policies.ppo import Ppo, PpoConfig
+from astra_data.policies.running_policy import POLICY, Observed, PolicyFile, RunningPolicy, running
+from astra_data.policies.sac import Sac, SacConfig
 from astra_data.robots.registry import task_named
+from astra_data.worlds.protocols import TargetEnv
 from astra_data.worlds.task import Task
+
+_FORESIGHT_S = 1.0
+_CHOICES = 16  # random commands to choose one from that stays clear of walls
+
+HoldTimes = Annotated[tuple[NotNegative, NotNegative], AfterValidator(in_order)]
+"""The shortest and the longest time for which a random command is held."""
+
+
+def held_steps(hold_s: HoldTimes, timestep_s: float) -> tuple[int, int]:
+    """Return the fewest and the most control steps for which a command is held."""
+    shortest, longest = (max(1, round(seconds / timestep_s)) for seconds in hold_s)
+    return shortest, longest
+
+
+class WallWatch:
+    """Predicts with the abstract simulator how close to walls commands lead within a second."""
+
+    def __init__(self, task: Task, clearance_m: float) -> None:
+        self.clearance_m, self._task, self._maze = clearance_m, task, task.maze
+
+    def clearance(self, state: Tensor, commands: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the least clearance in m (B, K) if `commands` (B, K, A) are held from `state` (B, S)."""
+        task, (count, choices, _) = self._task, commands.shape
+        simulator = task.simulator(count * choices)
+        simulator.reset_to(task.abstraction(state).repeat_interleave(choices, dim=0))
+        action = torch.from_numpy(commands).float().flatten(0, 1)
+        nearest = np.full((count, choices), np.inf)
+        for _ in range(round(_FORESIGHT_S / task.timestep_s)):
+            position = simulator.step(action)[:, :2].double().numpy()
+            nearest = np.minimum(nearest, self._maze.clearance(position).reshape(count, choices))
+        return nearest
+
+
+class RandomCommands:
+    """Commands from U[-1, 1] per axis, each held for a random number of steps."""
+
+    def __init__(self, action_size: int, hold_steps: tuple[int, int], watch: WallWatch | None = None) -> None:
+        """Hold commands (A,) for `hold_steps` (fewest, most), or until `watch` predicts a wall."""
+        self._size, self._hold_steps, self._watch = action_size, hold_steps, watch
+
+    def start(self, rows: range, seed: int) -> None:
+        """Begin new episodes of as many robots as `rows`."""
+        self._rng = generator(seed, "behavior")
+        self._command = np.zeros((len(rows), self._size))
+        self._left = np.zeros(len(rows), dtype=int)
+
+    def act(self, state: Tensor, goal: Tensor) -> Tensor:
+        """Return commands (B, A); goals are ignored, and so are states unless walls are watched for."""
+        over = self._left == 0
+        if self._watch is not None:
+            over |= self._watch.clearance(state, self._command[:, None])[:, 0] < self._watch.clearance_m
+        due = np.flatnonzero(over)
+        choices, chosen = self._proposed(due, 1 if self._watch is None else _CHOICES), np.zeros(len(due), dtype=int)
+        if self._watch is not None:  # the first that stays clear of walls, or the clearest
+            clearance = self._watch.clearance(state[due], choices)
+            chosen = clearance.clip(max=self._watch.clearance_m).argmax(axis=1)
+        self._command[due] = choices[np.arange(len(due)), chosen]
+        self._left[due] = self._times(len(due))
+        self._left -= 1
+        return torch.from_numpy(self._command).float()
+
+    def _proposed(self, due: NDArray[np.intp], choices: int) -> NDArray[np.float64]:
+        """Draw `choices` commands (n, K, A) for each of the robots `due` (n,)."""
+        return self._rng.uniform(-1.0, 1.0, (len(due), choices, self._size))
+
+    def _times(self, count: int) -> NDArray[np.int64]:
+        """Draw for how many steps `count` commands are held, (count,)."""
+        fewest, most = self._hold_steps
+        return self._rng.integers(fewest, most + 1, count)
+
+
+class StressCommands(RandomCommands):
+    """Commands that seek failures: at the bounds, half of them reversed, held for log-uniform times."""
+
+    def _proposed(self, due: NDArray[np.intp], choices: int) -> NDArray[np.float64]:
+        drawn = super()._proposed(due, choices)
+        drawn /= np.abs(drawn).max(axis=-1, keepdims=True)
+        before = self._command[due, None]
+        is_reversed = (self._rng.random((len(due), choices, 1)) < 0.5) & before.any(axis=-1, keepdims=True)
+        return np.where(is_reversed, -before, drawn)
+
+    def _times(self, count: int) -> NDArray[np.int64]:
+        fewest, most = self._hold_steps
+        drawn = np.exp(self._rng.uniform(np.log(fewest), np.log(most + 1), count))
+        return drawn.astype(np.int64).clip(fewest, most)
+
+
+class PolicyBehavior:
+    """A policy that draws its actions from its distribution, as it does in training."""
+
+    def __init__(self, running: RunningPolicy) -> None:
+        self._running = running
+
+    def start(self, rows: range, seed: int) -> None:
+        """Begin new episodes of as many robots as `rows`."""
+        self._running.start(len(rows), torch.Generator().manual_seed(derive(seed, "behavior")))
+
+    def act(self, state: Tensor, goal: Tensor) -> Tensor:
+        """Return actions (B, A) for target states (B, S) and goals (B, G)."""
+        return self._running.act(state, goal)
+
+
+class MixedBehavior:
+    """A policy on a part of the robots, random commands on the others."""
+
+    def __init__(self, policy: "Behavior", random: RandomCommands, share: float) -> None:
+        """Let `random` act on a `share` of all episodes, spread evenly: the first n have it as well."""
+        self._policy, self._random, self._share = policy, random, share
+
+    def start(self, rows: range, seed: int) -> None:
+        """Begin the episodes `rows`."""
+        self._policy.start(rows, seed)
+        self._random.start(rows, seed)
+        episodes = torch.arange(rows.start, rows.stop + 1, dtype=torch.float64)
+        before = torch.floor(episodes * self._share + 1e-9)
+        self.is_random = (before.diff() > 0).unsqueeze(1)
+
+    def act(self, state: Tensor, goal: Tensor) -> Tensor:
+        """Return actions (B, A) for target states (B, S) and goals (B, G)."""
+        return torch.where(self.is_random, self._random.act(state, goal), self._policy.act(state, goal))
+
+
+Behavior = RandomCommands | PolicyBehavior | MixedBehavior
+
+
+def record(
+    task: Task,
+    env: TargetEnv,
+    behavior: Behavior,
+    rows: range,
+    writer: StagedWriter,
+    *,
+    max_steps: int,
+    seed: int,
+    progress: Progress,
+) -> int:
+    """Record the episodes `rows` as one batch, staging each new one when it ends; return the number of steps."""
+    active, began = torch.ones(len(rows), dtype=torch.bool), time.perf_counter()
+    columns, steps = dict[str, Array](), 0
+    for step in range(max_steps):
+        state, goal = env.state, env.goal.clone()
+        action = behavior.act(state, goal)
+        outcome = env.step(action, active)
+        ended = outcome.terminated
+        truncated = torch.full_like(ended, step == max_steps - 1) & ~ended
+        row = ({names.GOAL: goal} if goal.shape[1] else {}) | {
+            names.STATE: state,
+            names.ACTION: task.limits.in_units(action),
+            names.NEXT_STATE: env.state,
+            names.REWARD: outcome.reward,
+            names.TERMINATED: ended,
+            names.TRUNCATED: truncated,
+            names.DONE: ended | truncated,
+            names.SUCCESS: task.objective.succeeded(outcome.success, ended & ~outcome.success, step + 1),
+        }
+        for name, values in row.items():
+            if name not in columns:
+                columns[name] = np.empty((max_steps, *values.shape), values.numpy().dtype)
+            columns[name][step] = values.numpy()
+        steps += int(active.sum())
+        for index in torch.nonzero(active & row[names.DONE]).squeeze(1).tolist():
+            if rows[index] not in writer.staged:
+                episode = {name: as_column(values[: step + 1, index]) for name, values in columns.items()}
+                writer.add(Episode(rows[index], episode, outcome_of(episode) | {"seed": seed}), rows[index])
+        active &= ~row[names.DONE]
+        rate = steps / (time.perf_counter() - began)
+        progress((step + 1) / max_steps, f"{rate:,.0f} target steps/s")
+        if not active.any():
+            break
+    return steps
+
+
+_PPO_ENVS = 128
+_SAC_ENVS = 32  # target environments stepped side by side
+
+_SAC = SacConfig(buffer_size=1_000_000)  # settings with which the humanoid learns to stay up; its rewards are 5 a step
+_SAC_SIZES = (256, 256)  # hidden layers of actor and critics
+
+type Judge = Callable[[Mapping[str, float]], tuple[float, str]]
+"""Given the figures of an iteration, returns the share done and a note."""
+type Metadata = dict[str, Any]
+"""What a dataset records about the behavior."""
+
+_TEST_EPISODES = 32  # test episodes after each iteration
+
+
+def suboptimal_by_ppo(
+    task: Task, *, steps: int, seed: int, folder: Path, num_threads: int | None, progress: Progress
+) -> tuple[PolicyFile, Metadata]:
+    """Train a policy without memory on φ of the target's state, for `steps`; resume from a checkpoint in `folder`."""
+    torch.manual_seed(derive(seed, "suboptimal policy"))
+    world = ObservedTargetEnv(task, _PPO_ENVS, num_threads=num_threads)
+    policy = ActorCritic(ActorCriticShape(world.observation_size, world.action_size))
+    ppo = Ppo(world, policy, PpoConfig(total_steps=steps), horizon=task.objective.horizon, seed=seed)
+    judge: Judge = lambda figures: (ppo.steps / steps, f"reward per step {figures['reward']:.3f}")  # noqa: E731
+    return _trained(ppo, world, judge, folder, progress, "abstract")
+
+
+def suboptimal_by_sac(
+    task: Task, *, steps: int, episode_steps: int, seed: int, folder: Path, num_threads: int | None, progress: Progress
+) -> tuple[PolicyFile, Metadata]:
+    """Train one on the full state, until episodes last `episode_steps` on average, or for `steps`."""
+    if not task.objective.is_lasting:
+        raise BadInputError(f"in {task.name} good episodes are short: use 'suboptimal_ppo'")
+    torch.manual_seed(derive(seed, "suboptimal policy"))
+    world = ObservedTargetEnv(task, _SAC_ENVS, observed="full", num_threads=num_threads)
+    actor = SoftActor(PolicyShape(world.observation_size, world.action_size, hidden_sizes=_SAC_SIZES))
+    config = _SAC.model_copy(update={"total_steps": steps})
+    sac = Sac(world, actor, config, horizon=task.objective.horizon, seed=seed)
+    running = RunningPolicy(task, actor, observed="full")
+
+    def judge(figures: Mapping[str, float]) -> tuple[float, str]:
+        lasted = _lasts(running, derive(seed, f"trial {sac.steps}"), num_threads)
+        return max(sac.steps / steps, lasted / episode_steps), f"episodes last {lasted:.0f} steps"
+
+    return _trained(sac, world, judge, folder, progress, "full")
+
+
+def _trained(
+    learner: Ppo | Sac,
+    world: ObservedTargetEnv,
+    judge: Judge,
+    folder: Path,
+    progress: Progress,
+    observed: Observed,
+) -> tuple[PolicyFile, Metadata]:
+    """Train until `judge`, given the figures of an iteration, returns a share done of 1, with a note."""
+
+    def go_on(state: dict[str, Any]) -> None:
+        observation = world.load_state_dict(state["world"])
+        learner.load_state_dict(state["learner"], observation, goes_on=bool(state["world"]))
+
+    logbook = Logbook(folder / "training.safetensors", go_on)
+    share = logbook.points[-1]["share"] if logbook.points else 0.0
+    while share < 1.0:
+        share, note = judge(learner.iterate())
+        logbook.points.append({"steps": learner.steps, "share": share})
+        rate = learner.steps / logbook.stopwatch.seconds
+        progress(min(1.0, share), f"training the behavior: {rate:,.0f} steps/s  {note}")
+        if logbook.is_due or share >= 1.0:
+            logbook.keep({"learner": learner.state_dict(), "world": world.state_dict()})
+    policy, config = learner.policy.requires_grad_(False), learner.config.model_dump(mode="json")
+    settings = {"num_envs": learner.env.num_envs, "hidden_sizes": list(policy.shape.hidden_sizes), **config}
+    spent = logbook.stopwatch.spent()
+    metadata = {"trained_steps": learner.steps, "learner": settings, "spent": spent}
+    return PolicyFile(policy, None, None, None, observed), metadata
+
+
+def _lasts(running: RunningPolicy, seed: int, num_threads: int | None) -> float:
+    """Return how many steps episodes of the policy last on average: more than those of its training."""
+    behavior, task = PolicyBehavior(running), running.task
+    env = task.target(_TEST_EPISODES, seed=derive(seed, "starts"), num_threads=num_threads)
+    env.reset()
+    behavior.start(range(_TEST_EPISODES), seed)
+    active, lasted = torch.ones(_TEST_EPISODES, dtype=torch.bool), 0
+    for _ in range(task.objective.horizon):
+        if not active.any():
+            break
+        lasted += int(active.sum())
+        active &= ~env.step(behavior.act(env.state, env.goal), active).terminated
+    return lasted / _TEST_EPISODES
+
 
 _TRAINING_SHARE = 0.8
 """Share of the progress bar for training the suboptimal policy."""
@@ -212,8 +476,6 @@ def _behavior(
     if commands := {"random": RandomCommands, "stress": StressCommands}.get(config.behavior):
         return _random(task, config, commands), {}
     if config.behavior.startswith("suboptimal"):
-        from astra_data.policies.collecting import suboptimal_by_ppo, suboptimal_by_sac  # noqa: PLC0415 - slow to import
-
         by = partial(suboptimal_by_sac, steps=_SAC_STEPS, episode_steps=_SAC_EPISODE_STEPS)
         if config.behavior == "suboptimal_ppo":
             by = partial(suboptimal_by_ppo, steps=config.ppo_steps)

@@ -8,9 +8,15 @@ from typing import Literal
 from matplotlib.figure import Figure
 
 from astra_data.reports.blocks import Picture
-from astra_data.reports.figures.errors import open_loop_error, predictive_validity, reliability
+from astra_data.reports.figures.charts import (
+    data_efficiency,
+    learning_curves,
+    open_loop_error,
+    predictive_validity,
+    reliability,
+    score_bars,
+)
 from astra_data.reports.figures.motion import mismatch, strips, trajectories
-from astra_data.reports.figures.scores import data_efficiency, learning_curves, score_bars
 from astra_data.reports.figures.style import Scene, png
 from astra_data.reports.results import Results
 

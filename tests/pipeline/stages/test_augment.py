@@ -28,14 +28,13 @@ from astra_data.dataset.columns import (
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.writer import DatasetWriter
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.pipeline.stages.augment import AugmentConfig, _free_uid, _moving, _shares, augment
+from astra_data.pipeline.stages.augment import AugmentConfig, Relocation, _free_uid, _moving, _shares, augment
 from astra_data.pipeline.stages.collect import CollectConfig, collect
 from astra_data.pipeline.stages.pair import PairConfig, pair
 from astra_data.robots.ant.tasks import WALL_REACH_M, up_cosine
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.geometry import rotation_matrix
 from astra_data.worlds.plane.navigation import Navigation
-from astra_data.worlds.plane.relocation import Relocation
 
 CONFIG = AugmentConfig(episodes=24, held_out_share=0.25, min_steps=5)
 

@@ -18,9 +18,8 @@ from astra_data.dataset.doctor.check import check
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.staging import StagedWriter
 from astra_data.pipeline.stages import collect as stage
-from astra_data.pipeline.stages.collect import CollectConfig, collect
-from astra_data.policies import collecting as suboptimal
-from astra_data.policies.collecting import WallWatch, record
+from astra_data.pipeline.stages import collect as suboptimal
+from astra_data.pipeline.stages.collect import CollectConfig, WallWatch, collect, record
 from astra_data.robots.registry import TASKS
 
 TINY = CollectConfig(episodes=3, max_steps=15)

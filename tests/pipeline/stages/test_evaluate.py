@@ -20,10 +20,10 @@ from astra_data.core.progress import silent
 from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE, Column, Episode
 from astra_data.grounding.files import load_target_encoder, save_target_encoder
 from astra_data.grounding.model import GroundingModel
+from astra_data.methods.rma import RmaConfig
 from astra_data.pipeline.stages.evaluate import EvaluateConfig, evaluate
 from astra_data.pipeline.stages.train import train
 from astra_data.policies.networks import ActorCritic, ActorCriticShape
-from astra_data.policies.rma import RmaConfig
 from astra_data.policies.running_policy import PolicyFile
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.plane.navigation import Navigation

@@ -13,9 +13,9 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, silent
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.methods import METHODS
+from astra_data.methods.rma import RmaConfig
 from astra_data.pipeline.stages.train import train
 from astra_data.policies.networks import ActorCritic, ActorCriticShape, SoftActor, Student
-from astra_data.policies.rma import RmaConfig
 from astra_data.policies.running_policy import PolicyFile
 from astra_data.policies.simulator_env import Simulation, WorldConfig, command_limit, plus
 from astra_data.policies.train import PpoTrainConfig, SacTrainConfig, Training

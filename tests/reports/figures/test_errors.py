@@ -3,7 +3,7 @@ from pathlib import Path
 import numpy as np
 from figures_shown import legend
 
-from astra_data.reports.figures.errors import open_loop_error, predictive_validity, reliability
+from astra_data.reports.figures.charts import open_loop_error, predictive_validity, reliability
 from astra_data.reports.figures.style import Scene, method_color, png
 from astra_data.reports.results import TESTED, Errors, Line, Results
 from astra_data.robots.registry import TASKS

@@ -24,7 +24,7 @@ from astra_data.reports.figures.motion import (
 )
 from astra_data.reports.figures.style import DEPLOYED, SIMULATED, Scene
 from astra_data.reports.results import TESTED, Line, Results
-from astra_data.robots.nao.target import NaoEnv
+from astra_data.robots.nao.tasks import NaoEnv
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.plane.mazes import U_MAZE
 from astra_data.worlds.protocols import Step

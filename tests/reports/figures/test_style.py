@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from astra_data.methods import METHODS
-from astra_data.reports.figures.scores import score_bars
+from astra_data.reports.figures.charts import score_bars
 from astra_data.reports.figures.style import Scene, coverage, method_color, png, style
 from astra_data.reports.results import TESTED, Line, Results
 from astra_data.robots.registry import TASKS

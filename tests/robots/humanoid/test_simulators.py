@@ -8,13 +8,6 @@ from torch import Tensor
 
 from astra_data.core.arrays import Floats
 from astra_data.robots.humanoid.abstraction import humanoid_to_walker2d
-from astra_data.robots.humanoid.simulators import (
-    HumanoidExtendedKinematics,
-    HumanoidKinematics,
-    HumanoidWalker2d,
-    sole_clearance,
-    walker_model,
-)
 from astra_data.robots.humanoid.target import (
     COMMANDED,
     CONTACT_M,
@@ -24,6 +17,13 @@ from astra_data.robots.humanoid.target import (
     HumanoidEnv,
     Locomotion,
     humanoid_model,
+)
+from astra_data.robots.humanoid.tasks import (
+    HumanoidExtendedKinematics,
+    HumanoidKinematics,
+    HumanoidWalker2d,
+    sole_clearance,
+    walker_model,
 )
 
 # The humanoid's velocities that the walker has: x, z, pitch, and the commanded joints.

@@ -26,7 +26,7 @@ from astra_data.pipeline.stages.train import train
 from astra_data.policies.train import PpoTrainConfig
 from astra_data.robots.humanoid import target as humanoid
 from astra_data.robots.humanoid import tasks
-from astra_data.robots.humanoid.simulators import (
+from astra_data.robots.humanoid.tasks import (
     HumanoidExtendedKinematics,
     HumanoidKinematics,
     HumanoidWalker2d,

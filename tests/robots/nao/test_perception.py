@@ -5,7 +5,7 @@ import pytest
 from nao_values import NO_ERRORS
 from numpy.typing import NDArray
 
-from astra_data.robots.nao.perception import BallSight, Localisation, PerceptionErrors
+from astra_data.robots.nao.tasks import BallSight, Localisation, PerceptionErrors
 
 STEP_S = 0.192
 ROBOTS = 4000

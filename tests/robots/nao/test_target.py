@@ -6,7 +6,7 @@ import torch
 from nao_values import NO_ERRORS
 
 from astra_data.core.arrays import Floats
-from astra_data.robots.nao.target import NaoEnv
+from astra_data.robots.nao.tasks import NaoEnv
 from astra_data.robots.registry import TASKS
 
 

@@ -7,7 +7,7 @@ from fake_dataset import write_fake
 from figures_shown import legend
 from matplotlib.figure import Figure
 
-from astra_data.reports.figures.scores import data_efficiency, learning_curves, on_one_grid, score_bars
+from astra_data.reports.figures.charts import data_efficiency, learning_curves, on_one_grid, score_bars
 from astra_data.reports.figures.style import Scene
 from astra_data.reports.results import SIMULATED, TESTED, Line, Results, TrainingFacts
 from astra_data.robots.registry import TASKS

@@ -16,8 +16,8 @@ from astra_data.dataset.columns import (
     Array,
     Episode,
 )
+from astra_data.pipeline.stages.augment import Relocation, outcomes, positions
 from astra_data.robots.registry import TASKS
-from astra_data.worlds.plane.relocation import Relocation, outcomes, positions
 
 TASK = TASKS["antmaze-umaze"]
 KICKING = TASKS["nao-kick"]
@@ -110,7 +110,7 @@ def test_each_copy_has_a_goal_of_its_own_among_those_of_the_task() -> None:
     episode = Episode(0, columns | {SUCCESS: np.zeros(20, bool)})
     moving, rng = [TASK.state, replace(TASK.state, name=NEXT_STATE), TASK.action], np.random.default_rng(0)
     copies = [relocation().copied(episode, moving, rng) for _ in range(12)]
-    goals = np.array([copy.columns[GOAL] for copy in copies if copy is not None])
+    goals = np.array([copy[0][GOAL] for copy in copies if copy is not None])
     assert len(goals) == 12 and (goals == goals[:, :1]).all() and len(np.unique(goals[:, 0], axis=0)) == 12
     assert 0.0 < np.abs(goals - AIM).max() <= 0.6 + 1e-6
 
@@ -137,7 +137,7 @@ def kicks(count: int, episode: Episode) -> list[dict[str, Array]]:
     place, rng = replace(relocation(margin_m=0.3, rotations="any"), task=KICKING), np.random.default_rng(0)
     moving = [KICKING.state, replace(KICKING.state, name=NEXT_STATE), KICKING.action]
     copied = [place.copied(episode, moving, rng) for _ in range(count)]
-    return [copy.columns for copy in copied if copy is not None]
+    return [copy[0] for copy in copied if copy is not None]
 
 
 def test_a_ball_moves_with_its_robot() -> None:

@@ -11,7 +11,7 @@ from mcap.writer import CompressionType, Writer
 from mcap_recordings import Message, command, ns, pose, write_json
 
 from astra_data.core.errors import BadInputError
-from astra_data.io.mcap_file import McapFile, McapMessage, Timeline
+from astra_data.io.importers.mcap import McapFile, Timeline
 from astra_data.io.recording import Source
 
 CHUNK = 2000
@@ -173,17 +173,20 @@ def drive(begin: float, end: float) -> list[Message]:
     return sorted(messages, key=lambda message: message[1])
 
 
+McapMessage = tuple[str, int, int, Any, bool]
+
+
 def log_times(messages: Iterable[McapMessage]) -> list[int]:
-    return [message.log_time for message in messages]
+    return [log_time for _, _, log_time, *_ in messages]
 
 
 def check(read: Timeline) -> list[McapMessage]:
     """Compare the times of messages with the moments, and return the messages."""
     messages = list(read.messages())
-    times = [message.time for message in messages]
+    times = [time for _, time, *_ in messages]
     assert times == sorted(times) and read.moments.keys() == {"/pose", "/command"}
     for topic, moments in read.moments.items():
-        assert moments.tolist() == [message.time for message in messages if message.topic == topic]
+        assert moments.tolist() == [time for of, time, *_ in messages if of == topic]
     return messages
 
 
@@ -200,7 +203,7 @@ def test_messages_come_in_the_order_of_their_times(tmp_path: Path, mixed: str) -
     order = np.argsort(keys[mixed], kind="stable")
     messages = check(timeline(tmp_path / "log.mcap", [ordered[at] for at in order]))
     assert log_times(messages) == [ns(time) for _, time, _ in ordered]
-    assert all(message.time == message.log_time and not message.is_back for message in messages)
+    assert all(time == log_time and not is_back for _, time, log_time, _, is_back in messages)
 
 
 @pytest.mark.parametrize("step_s", [0.6, 2.0, 100.0])
@@ -209,8 +212,8 @@ def test_a_clock_that_is_set_back_begins_anew(tmp_path: Path, step_s: float) -> 
     set_back = [(topic, time - step_s, content) for topic, time, content in after]
     messages = check(timeline(tmp_path / "log.mcap", before + set_back))
     assert log_times(messages) == [ns(time) for _, time, _ in before + set_back]
-    assert [at for at, message in enumerate(messages) if message.is_back] == [len(before)]
-    pause_ns = messages[len(before)].time - messages[len(before) - 1].time
+    assert [at for at, message in enumerate(messages) if message[-1]] == [len(before)]
+    pause_ns = messages[len(before)][1] - messages[len(before) - 1][1]
     assert pause_ns > ns(PAUSE_S)
 
 

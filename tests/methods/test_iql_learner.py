@@ -10,8 +10,8 @@ from torch import Tensor
 from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import derive
 from astra_data.grounding.paired_episodes import draw_steps
-from astra_data.policies import iql as module
-from astra_data.policies.iql import Experience, Iql, IqlConfig, transitions
+from astra_data.methods import iql as module
+from astra_data.methods.iql import Experience, Iql, IqlConfig, transitions
 from astra_data.policies.networks import ActorCritic, ActorCriticShape, Policy
 
 QUICK = IqlConfig(

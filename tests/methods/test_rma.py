@@ -3,8 +3,8 @@ import torch
 from toy_worlds import Slope, train, whole_and_resumed
 
 from astra_data.core.seeding import derive
+from astra_data.methods.rma import Adaptation, RmaConfig
 from astra_data.policies.networks import AdaptiveShape, Student, Teacher
-from astra_data.policies.rma import Adaptation, RmaConfig
 
 HISTORY = 40
 

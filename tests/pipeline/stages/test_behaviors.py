@@ -14,8 +14,8 @@ from torch import Tensor
 from astra_data.core.progress import silent
 from astra_data.core.seeding import derive
 from astra_data.dataset.columns import ACTION, DONE, SUCCESS, TERMINATED, TRUNCATED, Episode
-from astra_data.policies import collecting as suboptimal
-from astra_data.policies.collecting import (
+from astra_data.pipeline.stages import collect as suboptimal
+from astra_data.pipeline.stages.collect import (
     RandomCommands,
     StressCommands,
     WallWatch,
