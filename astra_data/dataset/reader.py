@@ -1,8 +1,11 @@
 """Read a dataset: whole columns as contiguous arrays, or one episode at a time."""
 
+import json
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,16 +15,32 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from astra_data.core.arrays import Ints
-from astra_data.core.errors import BadInputError, CorruptDatasetError, optional
+from astra_data.core.errors import BadInputError, CorruptDatasetError, in_short, optional
 from astra_data.core.naming import RECORD, first_few
-from astra_data.dataset.cameras import clip_fault, decoded
-from astra_data.dataset.columns import RESERVED, SUCCESS, Array, Column, Episode
-from astra_data.dataset.contents import Contents, read_contents, read_values
-from astra_data.dataset.description import Digests, alteration, altered_columns, full_name, identity_of, read_digests
-from astra_data.dataset.format import CODEBASE_VERSION, INFO_PATH, OUR_FOLDER, STATS_PATH
-from astra_data.dataset.lerobot_recording import open_recording
-from astra_data.dataset.lerobot_rows import declared_columns
-from astra_data.dataset.plain import data_files, is_format_2, read_object
+from astra_data.dataset import plain
+from astra_data.dataset.cameras import Camera, clip_fault, decoded, read_cameras
+from astra_data.dataset.columns import RESERVED, SUCCESS, Array, Column, Episode, Scalar
+from astra_data.dataset.description import (
+    Digests,
+    alteration,
+    altered_columns,
+    altered_files,
+    full_name,
+    identity_of,
+    read_description,
+    read_digests,
+)
+from astra_data.dataset.format import (
+    CODEBASE_VERSION,
+    INFO_PATH,
+    METADATA_PATH,
+    OUR_FOLDER,
+    STATS_PATH,
+    SUBSETS_PATH,
+    TASKS_PATH,
+)
+from astra_data.dataset.lerobot_recording import RecordedFiles, declared_columns, open_recording
+from astra_data.dataset.parquet import read_arrays, read_blocks, rows_of, to_numpy
 from astra_data.dataset.statistics import ranges
 
 if TYPE_CHECKING:
@@ -31,9 +50,11 @@ if TYPE_CHECKING:
 
 REPAIR = "astra-data repair {} --out DIR"  # the command that writes what is intact in a folder to another one
 _SHOWN = 4  # datasets of a run
+_LOCATION = ("length", "data/chunk_index", "data/file_index")
 
 
-class Dataset(Contents):
+@dataclass(frozen=True, eq=False, repr=False)
+class Dataset:
     """A finished dataset of E episodes and N steps; make one with `Dataset.open`.
 
     Example:
@@ -44,6 +65,25 @@ class Dataset(Contents):
         >>> data.columns(["action"])["action"].shape  # (N, A)
         (240, 2)
     """
+
+    root: Path
+    info: dict[str, Any]  # meta/info.json
+    description: dict[str, Any]  # meta/astra/dataset.json
+    metadata: dict[str, list[Scalar | None]]  # key to one value per episode, None where one has none
+    uids: Ints  # (E,)
+    lengths: Ints  # steps of each episode, (E,)
+    order: list[int]  # the permutation of episode indices whose prefixes are the nested subsets
+    subset_seed: int
+    task: str
+    paths: list[Path]  # the data files in order
+    file_starts: Ints  # first row of each file
+    cameras: Mapping[str, Camera] = field(default_factory=dict)
+    recorded: RecordedFiles | None = None  # where LeRobot recorded it, how its rows are converted
+
+    @cached_property
+    def starts(self) -> Ints:
+        """First row of each episode, (E,)."""
+        return np.cumsum(self.lengths) - self.lengths
 
     @classmethod
     def open(cls, root: Path | str) -> "Dataset":
@@ -57,7 +97,7 @@ class Dataset(Contents):
         refuse_others(root)
         with explained(root):
             is_ours = (root / OUR_FOLDER).is_dir() or not (root / INFO_PATH).is_file()
-            return cls(**vars(read_contents(root) if is_ours else open_recording(root)))
+            return cls(**(_read(root) if is_ours else open_recording(root)))
 
     @property
     def features(self) -> dict[str, dict[str, Any]]:
@@ -170,7 +210,7 @@ class Dataset(Contents):
     def _statistics(self) -> dict[str, dict[str, Any]]:
         if self.recorded is not None:  # for which all values are read
             return ranges(self.blocks([column.name for column in self.schema]))
-        found = read_object(self.root / STATS_PATH)
+        found = plain.read_object(self.root / STATS_PATH)
         if isinstance(found, str):
             raise CorruptDatasetError(f"{self.root}: {STATS_PATH} {found}; astra-data repair rebuilds it")
         return found
@@ -193,7 +233,7 @@ class Dataset(Contents):
     def to_huggingface(self) -> "datasets.Dataset":
         """Return the rows as a `datasets.Dataset` in memory, once all values are verified."""
         self.require_whole()
-        table = pa.concat_tables(map(pq.read_table, data_files(self.root)))
+        table = pa.concat_tables(map(pq.read_table, plain.data_files(self.root)))
         rows: datasets.Dataset = optional("datasets").Dataset(table)
         return rows
 
@@ -246,6 +286,110 @@ class Dataset(Contents):
         return [Column.from_feature(name, self.features[name]) for name in names]
 
 
+def _read(root: Path) -> dict[str, Any]:
+    """Return the fields of `Dataset` of our dataset in folder `root`, and read the footers of its data files."""
+    description = read_description(root)
+    if altered := altered_files(root, description):
+        faults = (f"{path} {'was altered' if (root / path).exists() else 'missing'}" for path in altered)
+        raise CorruptDatasetError("; ".join(faults))
+    try:
+        return _parsed(root, description)
+    except (BadInputError, AttributeError, LookupError, TypeError, ValueError) as error:
+        raise CorruptDatasetError(f"its metadata are not those of a dataset ({in_short(error)})") from error
+
+
+def _parsed(root: Path, description: dict[str, Any]) -> dict[str, Any]:
+    """Read what is sealed, and therefore as the writer wrote it, unless somebody forged it."""
+    info, subsets = (json.loads((root / path).read_text(encoding="utf-8")) for path in (INFO_PATH, SUBSETS_PATH))
+    if not plain.is_data_path(info["data_path"]):
+        raise BadInputError(f"expected a path inside the dataset's folder, got {info['data_path']!r}")
+    cameras, faults_of = read_cameras(root, info)
+    info["features"] = {name: it for name, it in info["features"].items() if name not in {*cameras, *faults_of}}
+    columns = [Column.from_feature(name, feature) for name, feature in info["features"].items()]
+    tables = pa.concat_tables(read_blocks(plain.episodes_files(root), _LOCATION))
+    lengths, chunks, files = (to_numpy(tables.column(name), 1, "int64") for name in _LOCATION)
+    metadata = pa.concat_tables(read_blocks([root / METADATA_PATH])).to_pydict()
+    del metadata["length"]
+    uids = metadata.pop("episode_uid")
+    rows: dict[Path, int] = {}
+    for chunk, file, length in zip(chunks.tolist(), files.tolist(), lengths.tolist(), strict=True):
+        path = root / info["data_path"].format(chunk_index=chunk, file_index=file)
+        rows[path] = rows.get(path, 0) + length
+    faults = [f"{name}: {fault}" for name, fault in faults_of.items()]
+    faults += [
+        f"{path.relative_to(root)} does not belong to it" for path in sorted({*plain.data_files(root)} - {*rows})
+    ]
+    for path, expected in rows.items():
+        name, footer = path.relative_to(root), plain.read_footer(path)
+        if isinstance(footer, str):
+            faults.append(f"{name} {footer}")
+            continue
+        faults += [f"{name} has {footer[0]} rows, expected {expected}"] if footer[0] != expected else []
+        stored = [plain.PlainColumn(column.name, column.dtype, column.size) for column in columns]
+        faults += [f"{name} {fault}" for fault in plain.schema_faults(footer[1], stored)]
+    tasks = plain.read_tasks(root)
+    if isinstance(tasks, str) or 0 not in tasks:
+        faults.append(f"{TASKS_PATH} {tasks if isinstance(tasks, str) else 'has no task 0'}")
+    if faults:
+        raise CorruptDatasetError("; ".join(faults))
+    position = {uid: episode for episode, uid in enumerate(uids)}
+    return dict(
+        root=root,
+        info=info,
+        description=description,
+        metadata=metadata,
+        uids=np.array(uids, dtype=np.int64),
+        lengths=lengths,
+        order=[position[uid] for uid in subsets["uids"]],
+        subset_seed=int(subsets["seed"]),
+        task=tasks[0],
+        paths=list(rows),
+        file_starts=np.cumsum([0, *rows.values()])[:-1],
+        cameras=cameras,
+    )
+
+
+def read_values(dataset: Dataset, columns: Sequence[Column], episodes: Ints) -> Iterator[tuple[dict[str, Array], Ints]]:
+    """Yield `columns` of `episodes`, ascending indices, in blocks of whole episodes, and the indices of each."""
+    if not columns:
+        return
+    if dataset.recorded is not None:
+        yield from _converted(dataset, dataset.recorded, columns, episodes)
+        return
+    wanted = rows_of(episodes, dataset.starts, dataset.lengths, int(dataset.lengths.sum()))
+    ends = np.cumsum(dataset.lengths[episodes])
+    rest: dict[str, Array] = {}
+    row = first = 0
+    for block in read_arrays(dataset.paths, columns, wanted):
+        rest = {name: np.concatenate([rest[name], block[name]]) for name in block} if rest else block
+        rows = len(rest[columns[0].name])
+        last = int(np.searchsorted(ends, row + rows, side="right"))
+        cut = int(ends[last - 1]) - row if last > first else 0
+        if cut:
+            yield {name: values[:cut] for name, values in rest.items()}, episodes[first:last]
+        rest = {name: values[cut:] for name, values in rest.items()} if cut < rows else {}
+        row, first = row + cut, last
+    if rest or first < len(episodes):
+        raise CorruptDatasetError("the data files have other rows than when the dataset was opened")
+
+
+def _converted(
+    dataset: Dataset, recorded: RecordedFiles, columns: Sequence[Column], episodes: Ints
+) -> Iterator[tuple[dict[str, Array], Ints]]:
+    """Yield what `read_values` does of a recording of LeRobot, an episode at a time."""
+    rows = recorded.rows
+    lengths = dataset.lengths + rows.dropped
+    wanted = rows_of(episodes, recorded.first_rows, lengths, recorded.total_rows)
+    stored = list(rows.stored.values())
+    tables = read_blocks(dataset.paths, list(rows.stored), wanted)
+    found = (run for run in plain.runs(dataset.root / "data", tables, stored) if len(run) > rows.dropped)
+    for position, (episode, run) in enumerate(zip_longest(episodes.tolist(), found)):
+        if run is None or episode is None or len(run) != lengths[episode]:
+            raise CorruptDatasetError("its files were altered while they were read")
+        place = (episode, int(dataset.starts[episode]), int(dataset.uids[episode]))
+        yield rows.values(columns, run, *place), episodes[position : position + 1]
+
+
 def refuse_others(root: Path) -> None:
     """Raise BadInputError where `root` holds no dataset, versions of one, or one of another format."""
     refuse_versions(root)
@@ -266,12 +410,12 @@ def refuse_others(root: Path) -> None:
 
 def format_fault(root: Path) -> str | None:
     """Return a sentence if the dataset in `root` is LeRobot's and of another format than ours."""
-    info = read_object(root / INFO_PATH)
+    info = plain.read_object(root / INFO_PATH)
     version = info.get("codebase_version") if isinstance(info, dict) else CODEBASE_VERSION
     if version == CODEBASE_VERSION or (root / OUR_FOLDER).is_dir():
         return None
     found = f"{root} has LeRobot's format {version}, expected {CODEBASE_VERSION}"
-    if not is_format_2(root):
+    if not plain.is_format_2(root):
         return f"{found}: convert it with a version of lerobot that reads both"
     return f"{found}: convert it with lerobot's convert_dataset_v21_to_v30, or {REPAIR.format(root)}"
 
@@ -310,7 +454,7 @@ def explained(root: Path) -> Iterator[None]:
 
 def can_be_repaired(root: Path) -> bool:
     """Return whether columns and rate of the dataset in `root` are known, without which no value is."""
-    info = read_object(root / INFO_PATH)
+    info = plain.read_object(root / INFO_PATH)
     try:
         return not isinstance(info, str) and bool(declared_columns(root, info))
     except CorruptDatasetError:

@@ -17,7 +17,7 @@ from astra_data.dataset import columns as keys
 from astra_data.dataset.checkup import Clock, full_turns, shortest
 from astra_data.dataset.columns import Array, Column, Scalar
 from astra_data.dataset.inspection import Endings, is_terminated
-from astra_data.dataset.lerobot_rows import DERIVED_FLAGS, next_state_of
+from astra_data.dataset.lerobot_recording import DERIVED_FLAGS, next_state_of
 from astra_data.dataset.statistics import Rounding
 from astra_data.io.mapping import MAPPED_FLAGS, ColumnMapping, ImportMapping
 from astra_data.io.recording import Block

@@ -11,7 +11,7 @@ from pydantic import AfterValidator, Field, model_validator
 from astra_data.core.config import Config, Count, Positive, load_tables, validated
 from astra_data.core.errors import RecipeError
 from astra_data.dataset.columns import DONE, RESERVED, REWARD, ROLES, STATE, SUCCESS, TERMINATED, TRUNCATED
-from astra_data.dataset.lerobot_rows import FLOATS
+from astra_data.dataset.lerobot_recording import FLOATS
 
 Index = Annotated[int, Field(ge=0)]
 

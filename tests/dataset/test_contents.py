@@ -10,9 +10,8 @@ from fake_dataset import LENGTHS, concatenated, write_fake
 from astra_data.core.errors import CorruptDatasetError
 from astra_data.dataset import Dataset, parquet
 from astra_data.dataset.columns import STATE
-from astra_data.dataset.contents import read_values
 from astra_data.dataset.format import DATASET_PATH
-from astra_data.dataset.reader import can_be_repaired
+from astra_data.dataset.reader import can_be_repaired, read_values
 
 
 def drop_rows(root: Path) -> None:

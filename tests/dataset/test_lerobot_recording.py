@@ -30,7 +30,7 @@ from astra_data.dataset.columns import (
 )
 from astra_data.dataset.doctor.check import check
 from astra_data.dataset.doctor.repair import repair
-from astra_data.dataset.lerobot_rows import RECORDED_TASK
+from astra_data.dataset.lerobot_recording import RECORDED_TASK
 from astra_data.io.hub.sharing import push
 
 KEPT = (0, 2, 3)

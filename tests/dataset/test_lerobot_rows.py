@@ -9,8 +9,7 @@ from astra_data.core.errors import CorruptDatasetError
 from astra_data.dataset import columns as names
 from astra_data.dataset.columns import STATE, Array, Column
 from astra_data.dataset.format import DEFAULT_COLUMNS
-from astra_data.dataset.lerobot_recording import found_in
-from astra_data.dataset.lerobot_rows import RECORDED_TASK, Rows, declared_columns, name_of
+from astra_data.dataset.lerobot_recording import RECORDED_TASK, Rows, declared_columns, found_in, name_of
 from astra_data.dataset.plain import PlainColumn, Run
 
 More = Mapping[str, Array] | None

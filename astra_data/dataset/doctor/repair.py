@@ -12,13 +12,22 @@ import numpy as np
 from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.dataset import columns as names
 from astra_data.dataset import format as layout
-from astra_data.dataset import lerobot_rows
 from astra_data.dataset.cameras import Camera, clip_fault, read_cameras
 from astra_data.dataset.columns import Array, Column, Episode, Scalar, new_uid, renamed_metadata
 from astra_data.dataset.description import Digests, altered_files, read_description, read_digests
 from astra_data.dataset.doctor.salvage import whole_runs
-from astra_data.dataset.lerobot_recording import Found, found_in, left_out
-from astra_data.dataset.lerobot_rows import Rows
+from astra_data.dataset.lerobot_recording import (
+    DTYPES,
+    Found,
+    Rows,
+    declared_columns,
+    found_in,
+    lacking,
+    left_out,
+    name_of,
+    our_columns,
+    robot_of,
+)
 from astra_data.dataset.plain import PlainColumn, Run, is_format_2, read_object, read_small_table, read_tasks
 from astra_data.dataset.reader import Dataset, refuse_run, refuse_versions
 from astra_data.dataset.statistics import Roundings
@@ -216,14 +225,14 @@ def remains_of(folder: Path, sources: Sequence[Dataset], notes: list[str]) -> Re
     info = read_object(folder / layout.INFO_PATH)
     if isinstance(info, str):
         raise CorruptDatasetError(f"{folder}: {layout.INFO_PATH} {info}; without it columns and fps are unknown")
-    columns, specs, fps = lerobot_rows.declared_columns(folder, info)
+    columns, specs, fps = declared_columns(folder, info)
     if sources and names.EPISODE_UID not in info["features"]:
         raise BadInputError(f"{folder} has no column {names.EPISODE_UID}, by which it joins {sources[0].reference}")
     tasks, rows = read_tasks(folder), Rows({column.name: column for column in columns}, fps)
     has_ours = (folder / layout.OUR_FOLDER).is_dir()
-    is_ours = names.EPISODE_UID in rows.stored or has_ours or not rows.dropped or lerobot_rows.lacking(specs)
+    is_ours = names.EPISODE_UID in rows.stored or has_ours or not rows.dropped or lacking(specs)
     if not is_ours:
-        specs = lerobot_rows.our_columns(specs, has_tasks=not isinstance(tasks, str) and len(tasks) > 1)
+        specs = our_columns(specs, has_tasks=not isinstance(tasks, str) and len(tasks) > 1)
     if is_format_2(folder):
         notes.append(f"LeRobot's format {info['codebase_version']} became {layout.CODEBASE_VERSION}")
     cameras, unread = read_cameras(folder, info)
@@ -236,7 +245,7 @@ def remains_of(folder: Path, sources: Sequence[Dataset], notes: list[str]) -> Re
         notes.append(f"left out, because they are not numeric: {', '.join(others)}")
     kinds = {spec.name: spec.dtype for spec in specs}
     for column in columns:
-        kind = kinds.get(column.name, lerobot_rows.DTYPES[np.dtype(column.dtype).kind])
+        kind = kinds.get(column.name, DTYPES[np.dtype(column.dtype).kind])
         if column.dtype != kind:
             notes.append(f"{column.name} was {column.dtype} and is now {kind}")
     if isinstance(tasks, str):
@@ -293,10 +302,10 @@ def _description(folder: Path, remains: Remains, sources: Sequence[Dataset]) -> 
     config, old = {"folder": folder.name}, sources[0].description if sources else remains.old
     if not old:
         return {
-            "name": lerobot_rows.name_of(folder),
+            "name": name_of(folder),
             "stage": "repair",
             "config": config,
-            "environment": lerobot_rows.robot_of(remains.info),
+            "environment": robot_of(remains.info),
         }
     parents = [other.identity for other in sources[1:]]
     return successor(old, "episodes", stage="repair", config=config, out=folder, parents=parents)[0]

@@ -17,7 +17,7 @@ from astra_data.dataset.columns import DONE, NEXT_STATE, REWARD, STATE, TERMINAT
 from astra_data.dataset.doctor.check import check
 from astra_data.dataset.doctor.repair import Remains, join, remains_of, repair
 from astra_data.dataset.format import DATASET_PATH, DIGESTS_PATH, INFO_PATH, METADATA_PATH, SUBSETS_PATH
-from astra_data.dataset.lerobot_rows import RECORDED_TASK
+from astra_data.dataset.lerobot_recording import RECORDED_TASK
 
 
 @pytest.fixture
