@@ -42,33 +42,25 @@ if TYPE_CHECKING:
     from astra_data.worlds.protocols import Simulator as Simulator
     from astra_data.worlds.task import Task as Task
 
-_MODULES = {
-    "Column": "dataset.columns",
-    "Dataset": "dataset.reader",
-    "DatasetWriter": "dataset.writer",
-    "Episode": "dataset.columns",
-    "Frames": "dataset.frames",
-    "METHODS": "methods",
-    "Objective": "worlds.objective",
-    "Simulator": "worlds.protocols",
-    "StagedWriter": "dataset.staging",
-    "TASKS": "robots.registry",
-    "Task": "worlds.task",
-    "align": "pipeline.stages.align",
-    "augment": "pipeline.stages.augment",
-    "collect": "pipeline.stages.collect",
-    "evaluate": "pipeline.stages.evaluate",
-    "ground": "pipeline.stages.ground",
-    "label": "pipeline.stages.label",
-    "load_policy": "pipeline.trained_policy",
-    "merge": "dataset.edit",
-    "pair": "pipeline.stages.pair",
-    "pull": "io.hub.sharing",
-    "push": "io.hub.sharing",
-    "run": "pipeline.run",
-    "subset": "dataset.edit",
-    "train": "pipeline.stages.train",
+_NAMES = {
+    "dataset.columns": ("Column", "Episode"),
+    "dataset.edit": ("merge", "subset"),
+    "dataset.frames": ("Frames",),
+    "dataset.reader": ("Dataset",),
+    "dataset.staging": ("StagedWriter",),
+    "dataset.writer": ("DatasetWriter",),
+    "io.hub.sharing": ("pull", "push"),
+    "methods": ("METHODS",),
+    "pipeline.run": ("run",),
+    "pipeline.trained_policy": ("load_policy",),
+    "robots.registry": ("TASKS",),
+    "worlds.objective": ("Objective",),
+    "worlds.protocols": ("Simulator",),
+    "worlds.task": ("Task",),
 }
+_STAGES = ("align", "augment", "collect", "evaluate", "ground", "label", "pair", "train")
+_MODULES = {name: module for module, names in _NAMES.items() for name in names}
+_MODULES |= {stage: f"pipeline.stages.{stage}" for stage in _STAGES}
 __all__ = sorted(_MODULES)
 
 

@@ -197,15 +197,6 @@ def atomic_folder(target: Path) -> Iterator[Path]:
         publish(folder, target)
 
 
-@contextmanager
-def atomic_file(target: Path) -> Iterator[Path]:
-    """Yield the path of a file in a hidden folder, which is renamed to `target` as `atomic_folder` does."""
-    refuse_existing(target)
-    with hidden_folder(target) as folder:
-        yield folder / target.name
-        publish(folder / target.name, target)
-
-
 def publish(finished: Path, target: Path) -> None:
     """Rename a finished file or folder to `target` beside it, unless that exists, once it is on the disk."""
     with writing(target):

@@ -347,9 +347,8 @@ def _announce(
     parts = [*left_out(rows, episodes), *rounded]
     if early := [episode.uid for episode in episodes if episode.is_done_early]:
         parts.append(
-            f"{names.DONE} is set before the last row of {len(early)} episodes "
-            f"({first_few(early, MOST_FAULTS)}), which go on there: an import of the files can end them "
-            "(`ends` in [split] of a mapping)"
+            f"{names.DONE} is set before the last row of {len(early)} episodes ({first_few(early, MOST_FAULTS)}), "
+            "which go on there: an import of the files can end them (`ends` in [split] of a mapping)"
         )
     for column in columns:
         stored = rows.stored.get(column.name)

@@ -136,8 +136,7 @@ class Dataset:
     def columns(self, names: Sequence[str], episodes: Collection[int] | None = None) -> dict[str, Array]:
         """Return whole columns by name, contiguous (n, size), or (n,) where there is one value per step.
 
-        The n steps are those of `episodes`, by default of all, given as indices; they come in the dataset's
-        order.
+        The n steps are those of `episodes`, by default of all, given as indices; they come in the dataset's order.
 
         Raises:
             CorruptDatasetError: a file cannot be read, or values differ from their digests.

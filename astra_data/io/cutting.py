@@ -415,9 +415,8 @@ def _cast(values: Array, column: Column) -> tuple[Array, Mask]:
             raise BadInputError("expected whole numbers")
         if (abs(sound.astype(float)) >= EXACT).any():
             raise BadInputError(
-                "numbers of 2^53 or more came as floats, which cannot represent them; "
-                "expected integers: no fractions or empty cells among them, no float fields in the column, "
-                "no scale, offset or clip"
+                "numbers of 2^53 or more came as floats, which cannot represent them; expected integers: no fractions "
+                "or empty cells among them, no float fields in the column, no scale, offset or clip"
             )
     elif column.dtype == "int64" and sound.dtype == np.uint64 and (sound >= 2**63).any():
         raise BadInputError("expected whole numbers below 2^63")

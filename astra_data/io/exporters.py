@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from astra_data.core.arrays import as_rows
 from astra_data.core.config import did_you_mean
-from astra_data.core.durable import atomic_file, atomic_folder
+from astra_data.core.durable import hidden_folder, publish, refuse_existing
 from astra_data.core.errors import BadInputError, optional
 from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED, Array, Episode
 from astra_data.dataset.compare import recordings_of
@@ -38,8 +38,11 @@ def export(dataset: Dataset, out: Path, *, format: str) -> None:
         raise BadInputError(f"{dataset.reference} cannot be exported: it lacks {', '.join(missing)}")
     if REWARD not in dataset.features:
         _log.warning("%s has no %s: rewards are written as 0", dataset.reference, REWARD)
-    with (atomic_folder if format == "minari" else atomic_file)(out) as path:
+    refuse_existing(out)
+    with hidden_folder(out) as folder:
+        path = folder if format == "minari" else folder / out.name
         EXPORTERS[format](dataset, path, out)
+        publish(path, out)
 
 
 def _d4rl(dataset: Dataset, path: Path, out: Path) -> None:

@@ -31,9 +31,8 @@ _OF_RECIPES = {"methods", "based_on"}
 class ColumnMapping(Config):
     """Where one column comes from.
 
-    The fields are concatenated; each row of a field with more than two dimensions is flattened. Then
-    `take`, `scale`, `offset` and `clip` are applied, in this order. A list with one entry applies to every
-    value.
+    The fields are concatenated; each row of a field with more than two dimensions is flattened. Then `take`, `scale`,
+    `offset` and `clip` are applied, in this order. A list with one entry applies to every value.
     """
 
     fields: Annotated[tuple[str, ...], Field(min_length=1)]
@@ -62,8 +61,7 @@ class ColumnMapping(Config):
     latched: bool = False
     """MCAP: published once or on change, so that the last value holds without limit."""
     gap_s: Positive | None = None
-    """MCAP: the longest time that the last value of this column's topics is held; by default that of `split`.
-    """
+    """MCAP: the longest time that the last value of this column's topics is held; by default that of `split`."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -146,8 +144,7 @@ class ImportMapping(Config):
     "{field}_{number}", if the names of fields end with the number of the episode, as in d3rlpy's files; a
     single value then belongs to the last row."""
     stacked: bool | None = None
-    """Whether fields are (episodes, steps, ...), as batches for learning are; where they may be, it has to be
-    given."""
+    """Whether fields are (episodes, steps, ...), as batches for learning are; where they may be, it has to be given."""
     transposed: bool = False
     """HDF5: rows lie along the last dimension, as in MATLAB's files."""
 

@@ -47,9 +47,8 @@ class IqlConfig(Config):
     discount: Share = 0.99
     """Discount factor per step."""
     return_steps: Count = 10
-    """Length of n-step returns, which sum recorded rewards and add the state value after them. 1 is the
-    published method: at 20 steps/s a single command hardly moves the robot, and its advantage drowns in the
-    critics' errors."""
+    """Length of n-step returns, which sum recorded rewards and add the state value after them. 1 is the published
+    method: at 20 steps/s a single command hardly moves the robot, and its advantage drowns in the critics' errors."""
     reward_scale: Positive = 1.0
     """Factor on the recorded reward."""
     policy_updates: Count = 600
@@ -66,8 +65,7 @@ class IqlConfig(Config):
     learning_rate: Positive = 1e-3
     """Learning rate of the policy at the start; decays to zero along a half cosine."""
     temperature: NotNegative = 10.0
-    """Inverse temperature of the advantage weights, which are clipped at 100; the authors' value for AntMaze.
-    """
+    """Inverse temperature of the advantage weights, which are clipped at 100; the authors' value for AntMaze."""
 
     @model_validator(mode="after")
     def _leaves_steps_to_learn_from(self) -> Self:

@@ -121,8 +121,7 @@ class SweepConfig(Config):
 class Recipe(Config):
     """One experiment: which methods, on which task, with which seeds and settings.
 
-    Below `seeds` come a table for each stage, `based_on`, `sweep`, and the methods' tables; see
-    `with_tables`.
+    Below `seeds` come a table for each stage, `based_on`, `sweep`, and the methods' tables; see `with_tables`.
     """
 
     task: str

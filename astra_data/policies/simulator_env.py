@@ -23,8 +23,7 @@ RewardSource = Literal["abstract", "predicted", "priced"]
 the task's own minus the predicted cost of failures, times `RISK_WEIGHT`."""
 
 RISK_WEIGHT = 4.0
-"""How many failures a predicted one counts as in the reward "priced": a failure also costs the rest of the
-episode."""
+"""How many failures a predicted one counts as in the reward "priced": a failure also costs the rest of the episode."""
 
 
 class WorldConfig(Config):

@@ -58,8 +58,7 @@ class TrainConfig(Config):
     """Maximum number of training runs. A policy that does not master its own simulator (in 100 episodes from
     the task's starts, acting by the mean of its actions) is trained again with another seed."""
     least_success: Share = 0.8
-    """Success in these episodes at which a simulator is mastered; if no try reaches it, the best one is kept.
-    """
+    """Success in these episodes at which a simulator is mastered; if no try reaches it, the best one is kept."""
 
 
 class PpoTrainConfig(TrainConfig, PpoConfig):
@@ -214,8 +213,7 @@ class TargetConfig(Config):
     num_envs: AtOnce | None = None
     """Target environments stepped in parallel; by default as in `[train]`."""
     memory_size: CountFromZero | None = None
-    """Size of the policy's own GRU; by default as in `[train]`. A policy that observes the full state needs
-    none."""
+    """Size of the policy's own GRU; by default as in `[train]`. A policy that observes the full state needs none."""
 
 
 @dataclass(frozen=True)

@@ -155,8 +155,7 @@ class AugmentConfig(Config):
     """Total number of episodes, including originals and held-out ones; instead of `copies`."""
     rotations: Rotations = "any"
     """"any": by any angle that keeps the commands within their limits, which is rarer for longer commands.
-    "quarter": by multiples of 90 degrees, each equally often, since these always keep commands within limits.
-    """
+    "quarter": by multiples of 90 degrees, each equally often, since these always keep commands within limits."""
     translations: bool = True
     """Move copies anywhere in the maze; otherwise a copy starts where the original did."""
     held_out_share: Annotated[float, Field(ge=0, lt=1)] = 0.1

@@ -61,9 +61,8 @@ def evaluate(
 
     Starts, goals and headings depend on the seed alone, so they are the same for every method, and with any
     `num_threads` of the physics. `policy` is what `train` made, or a policy in its place, `grounding` what `ground`
-    made and `target_encoder` what `align` made, for a row that trains, grounds, aligns; `reference` is the grounding
-    of the reference simulator, if there is one, and `recorded` the dataset with whose commands the policy's are
-    compared.
+    made and `target_encoder` what `align` made, for a row that trains, grounds, aligns; `reference` is the grounding of
+    the reference simulator, if there is one, and `recorded` the dataset with whose commands the policy's are compared.
 
     Raises:
         BadInputError: an input is missing, malformed or of another grounding, or `out` exists.

@@ -111,7 +111,6 @@ def _learned(learn: Learn, training: Training) -> tuple[PolicyFile, dict[str, An
             return policy, curve
     parts = returned if isinstance(returned, tuple) else (returned,)
     raise BadInputError(
-        f"learn returned {' and '.join(type(part).__name__ for part in parts) or 'nothing'}: expected a "
-        "PolicyFile and a dict of the learning curve; one that returns a policy of another learner is given "
-        "to an UserLearner"
+        f"learn returned {' and '.join(type(part).__name__ for part in parts) or 'nothing'}: expected a PolicyFile and "
+        "a dict of the learning curve; one that returns a policy of another learner is given to an UserLearner"
     )

@@ -311,10 +311,9 @@ class NaoEnv(PlanarTarget):
 _RADIUS_M = 0.1  # radius of the mass at walls in the simulators: as in AntMaze, and less than the robot's 0.14 m
 _BODY: dict[str, Any] = {"timestep_s": CONTROL_STEP_S, "radius_m": _RADIUS_M, "speed_m_s": SPEED_M_S}
 _CONTACT: dict[str, Any] = {"kick_reach_m": 0.35, "kick_m_s": 1.0, "reach_m": 0.22, "knock_m_s": 0.7}
-"""Of the robot with its ball. The reach of a kick is that of the paper's group's published simulator of an
-attacking NAO (AbstractSim 2023); a foot really reaches 0.22 m far. Walking bodies touch the ball with feet
-and shins, at a median of 0.22 m between the centers in episodes of random commands; it leaves at a median of
-0.7 m/s."""
+"""Of the robot with its ball. The reach of a kick is that of the paper's group's published simulator of an attacking
+NAO (AbstractSim 2023); a foot really reaches 0.22 m far. Walking bodies touch the ball with feet and shins, at a median
+of 0.22 m between the centers in episodes of random commands; it leaves at a median of 0.7 m/s."""
 
 KICK_RANGES = BallVariation(
     **WIDE_RANGES.model_dump(),
