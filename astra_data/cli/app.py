@@ -91,15 +91,13 @@ PANELS: dict[str, dict[str, Callable[..., None]]] = {
         "push walks me/walks": sharing.push,
         "pull me/walks": sharing.pull,
     },
-}
-"""Commands by what to type for each, as is said below its help; its first word is its name."""
+}  # commands by what to type for each, as is said below its help; its first word is its name
 _KINDS = {"int": "NUMBER", "float": "NUMBER", "str": "TEXT", "path": "PATH"}
 TyperArgument.display_type_rich = lambda self, ctx: None  # type: ignore[method-assign]
 """What an argument is, its name says."""
 TyperOption.display_type = (  # type: ignore[method-assign]
     lambda self, ctx: _KINDS.get(self.bare_type().removeprefix("list[").removesuffix("]").lower(), "")
-)
-"""And what an option takes, these words rather than its type."""
+)  # and what an option takes, these words rather than its type
 for panel, commands in PANELS.items():
     for example, command in commands.items():
         epilog = f"Example: astra-data {example}"

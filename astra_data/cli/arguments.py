@@ -118,8 +118,7 @@ _KINDS: dict[str, Any] = {
     **dict.fromkeys(("int", "Count", "AtOnce", "CountFromZero"), int),
     **dict.fromkeys(("float", "Positive", "NotNegative", "Share"), float),
     "bool": bool,
-}
-"""Types of settings by name, and what stands for one on the command line; else the default decides."""
+}  # types of settings by name, and what stands for one on the command line; else the default decides
 
 
 def with_settings(place: str) -> Callable[[Callable[..., None]], Callable[..., None]]:

@@ -12,10 +12,8 @@ from typing import Any
 from astra_data.core import durable
 from astra_data.core.errors import BadInputError
 
-CHECKPOINT = "checkpoint.safetensors"
-"""Name, or the end of it, of the file that a training goes on from."""
-_SETTINGS = "config.json"
-"""Name of the file of the settings in a folder."""
+CHECKPOINT = "checkpoint.safetensors"  # name, or the end of it, of the file that a training goes on from
+_SETTINGS = "config.json"  # name of the file of the settings in a folder
 MANIFEST = "manifest.json"
 
 

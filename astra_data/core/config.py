@@ -16,8 +16,7 @@ from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.core.naming import shortened
 
 Count = Annotated[int, Field(ge=1, le=10**12)]
-AtOnce = Annotated[int, Field(ge=1, le=10**6)]
-"""A number of things that are in memory at the same time."""
+AtOnce = Annotated[int, Field(ge=1, le=10**6)]  # a number of things that are in memory at the same time
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 CountFromZero = Annotated[int, Field(ge=0, le=10**12)]
@@ -26,10 +25,8 @@ Share = Annotated[float, Field(ge=0, le=1)]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 
 _UNNAMED = ""
-_MOST_FAULTS = 5
-"""Of a file that no user writes by hand."""
-_MOST_PARTS = 64
-"""Of a key in TOML, between dots."""
+_MOST_FAULTS = 5  # of a file that no user writes by hand
+_MOST_PARTS = 64  # of a key in TOML, between dots
 
 
 def in_order(ends: tuple[float, float]) -> tuple[float, float]:

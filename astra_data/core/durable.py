@@ -20,10 +20,8 @@ from astra_data.core.errors import AstraDataError, BadInputError, DiskError
 NO_FSYNC = "ASTRA_DATA_NO_FSYNC"
 """Environment variable; unless it is empty, files survive a kill but perhaps not a power failure."""
 
-_HIDDEN = re.compile(r"\..+\.tmp-\d+(-\d+)?")
-"""Names of what is being written."""
-_RESUMABLE = re.compile(r"\..+\.(staged|partial|pull-\d+\.\d+\.\d+)")
-"""Names of folders with which a command goes on."""
+_HIDDEN = re.compile(r"\..+\.tmp-\d+(-\d+)?")  # names of what is being written
+_RESUMABLE = re.compile(r"\..+\.(staged|partial|pull-\d+\.\d+\.\d+)")  # names of folders with which a command goes on
 
 _OF_THE_DISK = {
     **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), ("the disk is full", "free space")),
@@ -32,8 +30,7 @@ _OF_THE_DISK = {
     **dict.fromkeys(
         (errno.EIO, errno.ENODEV, errno.ENXIO, errno.ESTALE), ("the disk failed", "check that it is there")
     ),
-}
-"""Faults that are the disk's whatever was written: why, and what to do."""
+}  # faults that are the disk's whatever was written: why, and what to do
 
 
 @contextmanager

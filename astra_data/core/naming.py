@@ -6,17 +6,13 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 PLUS = "_plus"
-RECORD = "recipe.json"
-"""In the folder of a run: the settings that its artifacts were made with."""
-CODE = "code.json"
-"""Beside it: the digests of the user's code, "task" and methods by their names, and their settings."""
-RUNS = Path("runs")
-"""The folder of the folders of runs, unless another is given."""
+RECORD = "recipe.json"  # in the folder of a run: the settings that its artifacts were made with
+CODE = "code.json"  # beside it: the digests of the user's code, "task" and methods by their names, and their settings
+RUNS = Path("runs")  # the folder of the folders of runs, unless another is given
 STAGE_NAMES = (
     *("collect", "label", "augment", "pair", "subset", "ground"),
     *("train", "align", "select", "evaluate", "report"),
-)
-"""The stages in the order of the pipeline, for what need not load them."""
+)  # the stages in the order of the pipeline, for what need not load them
 
 
 def is_plus(row: str) -> bool:

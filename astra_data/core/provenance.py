@@ -18,8 +18,7 @@ CODE = ("astra_data", "pyproject.toml", "uv.lock")
 PACKAGES = (
     *("astra-data", "gymnasium", "gymnasium-robotics", "lerobot", "mujoco"),
     *("numpy", "pandas", "scipy", "torch"),
-)
-"""Packages whose versions can change a result."""
+)  # packages whose versions can change a result
 
 
 @cache

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from astra_data.core.arrays import Ints
 from astra_data.core.errors import CorruptDatasetError
 from astra_data.core.naming import RECORD, printable, shortened
 from astra_data.dataset.columns import Column
@@ -134,7 +134,7 @@ def hashes(ancestors: Ancestors) -> set[str]:
     return {content_hash for *_, content_hash in ancestors}
 
 
-def recordings_of(dataset: Dataset) -> NDArray[np.int64]:
+def recordings_of(dataset: Dataset) -> Ints:
     """Return the number of the recording that each episode is, or is a copy of, (E,), from 0 on."""
     sources, numbers = dataset.metadata.get("source_episode", [None] * len(dataset)), dict[int, int]()
     recorded = (uid if source is None else source for uid, source in zip(dataset.uids, sources, strict=True))

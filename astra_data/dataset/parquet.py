@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
 
+from astra_data.core.arrays import Bools, Ints
 from astra_data.core.errors import CorruptDatasetError, in_short
 from astra_data.dataset.columns import Array, Column
 from astra_data.dataset.format import CHUNK_SIZE, COMPRESSIONS, DATA_FILE_SIZE_MB
@@ -63,7 +63,7 @@ def open_parquet(path: Path) -> pq.ParquetFile:
 def read_blocks(
     paths: Sequence[Path],
     names: Sequence[str] | None = None,
-    wanted: NDArray[np.bool_] | None = None,
+    wanted: Bools | None = None,
     most_rows: int | None = None,
 ) -> Iterator[pa.Table]:
     """Yield the columns `names`, by default all, of all files in order, in blocks of whole `wanted` row groups."""
@@ -73,7 +73,7 @@ def read_blocks(
             with open_parquet(path) as file:
                 metadata = file.metadata
                 groups: list[int] = []
-                masks: list[NDArray[np.bool_]] = []
+                masks: list[Bools] = []
                 rows = 0
                 for group in range(metadata.num_row_groups):
                     begin, end = end, end + metadata.row_group(group).num_rows
@@ -90,9 +90,7 @@ def read_blocks(
             raise CorruptDatasetError(f"{name} cannot be read ({in_short(error)})") from error
 
 
-def rows_of(
-    chosen: NDArray[np.int64], starts: NDArray[np.int64], lengths: NDArray[np.int64], total: int
-) -> NDArray[np.bool_] | None:
+def rows_of(chosen: Ints, starts: Ints, lengths: Ints, total: int) -> Bools | None:
     """Return the mask (total,) of the rows of episodes `chosen`, as `read_blocks` takes it; None for all."""
     if len(chosen) == len(starts):
         return None
@@ -103,7 +101,7 @@ def rows_of(
 
 
 def read_arrays(
-    paths: Sequence[Path], columns: Sequence[Column], wanted: NDArray[np.bool_] | None = None
+    paths: Sequence[Path], columns: Sequence[Column], wanted: Bools | None = None
 ) -> Iterator[dict[str, Array]]:
     """Yield the blocks of `read_blocks` as contiguous arrays by name, (n,) or (n, size)."""
     most_rows = min(BLOCK_ROWS, max(1, BLOCK_VALUES // sum(column.size for column in columns)))

@@ -155,7 +155,7 @@ class Dataset:
         for block, _ in self._verified(self.specs(names), self.selected(episodes)):
             yield block
 
-    def selected(self, episodes: Collection[int] | None) -> NDArray[np.int64]:
+    def selected(self, episodes: Collection[int] | None) -> Ints:
         """Return the episode indices `episodes`, by default all, in the dataset's order."""
         if episodes is None:
             return np.arange(len(self))

@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
-from astra_data.core.arrays import as_rows
+from astra_data.core.arrays import Floats, as_rows
 from astra_data.dataset.columns import Array, Column
 from astra_data.dataset.format import EPISODES_PATH, QUANTILES, STATISTICS, STORED_STATISTICS, episodes_schema
 from astra_data.dataset.parquet import RotatingWriter, read_arrays, to_lists
@@ -18,7 +17,7 @@ BLOCK_VALUES = 2**26  # values held in memory at once: 256 MiB of float32
 ROWS_AT_ONCE = 1000  # rows held in memory before they are written
 
 
-def statistics(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+def statistics(rows: Floats) -> Floats:
     """Return `STATISTICS` (9, size) of `rows` (size, T), sorted in place; quantiles are interpolated."""
     # One row per index: numpy then sums pairwise, and sorting is fast.
     mean = rows.mean(axis=1)
@@ -33,7 +32,7 @@ def statistics(rows: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.vstack([rows[:, 0], rows[:, -1], mean, std, quantiles.T])
 
 
-def episode_statistics(columns: Iterable[Array]) -> NDArray[np.float64]:
+def episode_statistics(columns: Iterable[Array]) -> Floats:
     """Return `STATISTICS` (9, sum of sizes) of `columns` (T,) or (T, size), side by side."""
     values = [as_rows(column) for column in columns]
     rows = np.empty((sum(column.shape[1] for column in values), len(values[0])))
@@ -52,7 +51,7 @@ def side_by_side[C: (Column, PlainColumn)](columns: Iterable[C]) -> Iterator[tup
 def global_statistics(columns: Sequence[Column], frames: int, paths: Sequence[Path]) -> dict[str, dict[str, list[Any]]]:
     """Return meta/stats.json over all `frames`; quantiles are exact: memory grows by up to 20 bytes per frame."""
     indices = [(column, index) for column in columns for index in range(column.size)]
-    parts: dict[str, list[NDArray[np.float64]]] = {column.name: [] for column in columns}
+    parts: dict[str, list[Floats]] = {column.name: [] for column in columns}
     at_once = max(1, BLOCK_VALUES // frames)
     for first in range(0, len(indices), at_once):
         chosen = indices[first : first + at_once]
@@ -75,7 +74,7 @@ def global_statistics(columns: Sequence[Column], frames: int, paths: Sequence[Pa
 def ranges(blocks: Iterable[Mapping[str, Array]]) -> dict[str, dict[str, Any]]:
     """Return min, max and mean of each index of the columns in `blocks`, each (n,) or (n, size)."""
     found: dict[str, dict[str, Any]] = {}
-    totals: dict[str, NDArray[np.float64]] = {}
+    totals: dict[str, Floats] = {}
     rows = 0
     for block in blocks:
         for name, values in block.items():
@@ -96,12 +95,10 @@ class EpisodeRows:
         self.pictures: list[Mapping[str, Any]] = []
         self._writer = RotatingWriter(root, EPISODES_PATH, self._schema)
         self._rows: list[tuple[int, int, int]] = []
-        self._statistics: list[NDArray[np.float64]] = []
+        self._statistics: list[Floats] = []
         self._episodes = self._frames = 0
 
-    def append(
-        self, length: int, chunk: int, file: int, statistics: NDArray[np.float64], pictures: Mapping[str, Any]
-    ) -> None:
+    def append(self, length: int, chunk: int, file: int, statistics: Floats, pictures: Mapping[str, Any]) -> None:
         """Append an episode of `length` steps in data file `file` of `chunk`; `statistics` (9, sum of sizes).
 
         `pictures` are the places and statistics of its cameras, by the columns' names.

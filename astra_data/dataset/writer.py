@@ -7,7 +7,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -146,13 +145,11 @@ class DatasetWriter:
         self._is_open = True
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *raised: Any) -> None:
         """Commit, or after an error remove the hidden folder."""
         self._is_open = False
-        if error is not None:
-            self._exit.__exit__(kind, error, trace)
+        if raised[1] is not None:
+            self._exit.__exit__(*raised)
             return
         with self._exit:
             self._finish()

@@ -80,8 +80,7 @@ class Descent:
     ) -> None:
         """Start to fit the parameters of `model` that require gradients, or resume from `checkpoint` if it exists."""
         self.done = 0
-        self.best: int | None = None
-        """The update with the least held-out error."""
+        self.best: int | None = None  # the update with the least held-out error
         self._least, self._weights = float("inf"), dict[str, Tensor]()
         self._model, self._config = model, config
         self.parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]

@@ -8,6 +8,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from astra_data.core.arrays import Ints
 from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import derive, generator
 from astra_data.grounding.paired_episodes import PairedEpisodes, PairedWindows
@@ -61,9 +62,7 @@ def gap_report(task: Task, grounding: Grounding, episodes: PairedEpisodes, *, se
     return report
 
 
-def _starts(
-    lengths: NDArray[np.int64], horizon: int, rng: np.random.Generator
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _starts(lengths: Ints, horizon: int, rng: np.random.Generator) -> tuple[Ints, Ints]:
     """Draw episode and first step, (N,) each, of replays of `horizon` steps: one in each `_START_EVERY` starts."""
     possible = np.maximum(lengths - horizon + 1, 0)
     counts = -(-possible // _START_EVERY)

@@ -35,8 +35,7 @@ class ScatterModel(nn.Module):
         # An untrained network says that every moment is usual.
         for parameter in list(self.network.parameters())[-2:]:
             nn.init.zeros_(parameter)
-        self.usual = nn.Buffer(torch.ones(shape.state_size))
-        """Deviation of the residuals, (X,)."""
+        self.usual = nn.Buffer(torch.ones(shape.state_size))  # deviation of the residuals, (X,)
         self.forms = nn.Buffer(torch.zeros(shape.forms, shape.state_size))
         """Residuals of held-out steps in units of their scales, (F, X)."""
 

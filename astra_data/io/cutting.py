@@ -8,9 +8,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from astra_data.core.arrays import as_column, as_rows
+from astra_data.core.arrays import Bools, Floats, Ints, as_column, as_rows
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import first_few
 from astra_data.dataset import columns as keys
@@ -32,7 +31,6 @@ EXACT = 2**53  # floats represent whole numbers below this exactly
 _SHOWN = 8  # fields and files that are listed
 _KINDS = {"U": "text", "S": "text", "O": "values that are not numbers, such as missing ones"}
 
-Mask = NDArray[np.bool_]
 Cut = tuple[dict[str, Array], dict[str, Scalar]]  # the columns and the metadata of an episode
 Table = dict[str, Array]
 """Rows: columns by name and, by words that begin with "/" as no column does, what decides their cuts."""
@@ -90,7 +88,7 @@ class Cutter:
         self._clock = Clock(mapping.time or "", mapping.fps)
         self._tables: list[Table] = []
         self._parts: list[Block] = []
-        self._spent: list[NDArray[np.float64]] = []
+        self._spent: list[Floats] = []
         self._begins = "file"
         self._has_rows = self._was_torn = self._ended = False
 
@@ -183,7 +181,7 @@ class Cutter:
             source = {"source": self._parts[table["/part"][part[0]]].origin}
             yield from self._episode(values, source | {"source_row": int(table["/row"][part[0]])})
 
-    def _jumped(self, table: Table, kept: NDArray[np.int64]) -> Mask:
+    def _jumped(self, table: Table, kept: Ints) -> Bools:
         jump = self._mapping.split.jump
         if not jump:
             return np.zeros(len(kept), bool)
@@ -195,7 +193,7 @@ class Cutter:
     def _place(self, table: Table, at: int) -> str:
         return str(self._parts[table["/part"][at]].row_name(int(table["/row"][at])))
 
-    def _count(self, block: Block, bad: dict[str, Mask], rejected: Mask) -> None:
+    def _count(self, block: Block, bad: dict[str, Bools], rejected: Bools) -> None:
         tally = self.tally
         tally.rows += len(block) + block.torn
         tally.rejected_rows += int(rejected.sum()) + block.torn
@@ -290,13 +288,13 @@ class Cutter:
         tally.notes += [f"{name}, {fps} Hz declared" for name in named]
         tally.clock = str(self._clock)
 
-    def convert(self, block: Block) -> tuple[dict[str, Array], dict[str, Mask]]:
+    def convert(self, block: Block) -> tuple[dict[str, Array], dict[str, Bools]]:
         """Return the columns of `block`, (n,) or (n, size), and the rows where fields are not finite."""
         faults: list[str] = []
         fields = {name: _as_rows(name, block.values[name], faults) for name in self._mapping.fields}
         if faults:
             raise BadInputError(f"{block.origin}: {'; '.join(faults)}")
-        columns, bad = {}, dict[str, Mask]()
+        columns, bad = {}, dict[str, Bools]()
         for name in (*self._mapping.split.ends, *([self._mapping.time] if self._mapping.time else [])):
             bad[name] = np.asarray(~np.isfinite(fields[name]).all(axis=1))
         for name, spec in self._mapping.columns.items():
@@ -395,9 +393,9 @@ def _transformed(values: Array, spec: ColumnMapping) -> Array:
     return values if spec.clip is None else np.where(np.isfinite(values), np.clip(values, *spec.clip), values)
 
 
-def _cast(values: Array, column: Column) -> tuple[Array, Mask]:
+def _cast(values: Array, column: Column) -> tuple[Array, Bools]:
     """Return `values` (n, size) in the column's dtype, and which of them are finite."""
-    finite: Mask = np.asarray(np.isfinite(values))
+    finite: Bools = np.asarray(np.isfinite(values))
     sound = values[finite.all(axis=1)]
     if column.dtype == "float32":
         if sound.dtype.kind in "iu" and ((sound > EXACT) | (sound < -EXACT)).any():

@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from astra_data.core.arrays import as_rows
+from astra_data.core.arrays import Bools, as_rows
 from astra_data.core.config import did_you_mean
 from astra_data.core.durable import hidden_folder, publish, refuse_existing
 from astra_data.core.errors import BadInputError, optional
@@ -106,7 +105,7 @@ def _robomimic(dataset: Dataset, path: Path, out: Path) -> None:
                 file[f"mask/{key}"] = [f"demo_{episode}".encode() for episode in np.flatnonzero(part)]
 
 
-def _validation(dataset: Dataset) -> NDArray[np.bool_]:
+def _validation(dataset: Dataset) -> Bools:
     """Return which episodes (E,) are for validation; copies go where their recording goes."""
     recordings = recordings_of(dataset)
     held_out = np.array(dataset.metadata.get("held_out", [False] * len(dataset)), dtype=bool)

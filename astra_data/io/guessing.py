@@ -48,10 +48,8 @@ GOAL_NAME = re.compile(
     r"(?!.*(dist|bearing|_to_|_from_))(.+_)?(goal|destination|waypoint)"
     r"(?P<axis>_(x|y|z|yaw|heading|theta|psi|east|north|lat(itude)?|lon(gitude)?))?|"
     r"(target|ref|desired|des)_([xyz]|east|north)"
-)
-"""A goal where it is constant in each episode."""
-METERS_PER_DEGREE = 111_195.0
-"""Along a meridian of a sphere with Earth's mean radius, 6371 km."""
+)  # a goal where it is constant in each episode
+METERS_PER_DEGREE = 111_195.0  # along a meridian of a sphere with Earth's mean radius, 6371 km
 _DEGREE = math.pi / 180
 _UNITS = {
     "m/s": "mm_s 1e-3 cm_s 1e-2 m_s 1 m_per_s 1 mps 1 mph 0.44704 knots 0.514444 "
@@ -101,10 +99,8 @@ class Logs:
     fields: tuple[Field, ...]
     episodes: tuple[dict[str, Floats], ...]
     """Scaled values (T,) of each by a field's name, in rows whose states and commands are numbers."""
-    left_out: dict[str, int]
-    """How many rows lack a number, by the name of the field."""
-    cut_off: tuple[str, ...] = ()
-    """Files whose last line is cut off and left out."""
+    left_out: dict[str, int]  # how many rows lack a number, by the name of the field
+    cut_off: tuple[str, ...] = ()  # files whose last line is cut off and left out
 
     def of(self, role: Role) -> tuple[Field, ...]:
         """Return the fields with a role."""

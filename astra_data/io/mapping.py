@@ -24,8 +24,7 @@ def _other_than_zero(factor: float) -> float:
 
 Factor = Annotated[float, AfterValidator(_other_than_zero)]
 MAPPED_FLAGS = (TERMINATED, TRUNCATED, SUCCESS)
-_OF_RECIPES = {"methods", "based_on"}
-"""Keys that recipes have, and no mapping."""
+_OF_RECIPES = {"methods", "based_on"}  # keys that recipes have, and no mapping
 
 
 class ColumnMapping(Config):

@@ -13,8 +13,9 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from astra_data.core.arrays import Ints
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.checkup import GAP
 from astra_data.dataset.columns import ACTION, STATE
@@ -201,7 +202,7 @@ class Resampler:
         return [topic for topic in self._expiring if time - self.times[topic] > self._gap_ns[topic]]
 
 
-def usual_periods(moments: Mapping[str, NDArray[np.int64]], gap_ns: int) -> dict[str, float]:
+def usual_periods(moments: Mapping[str, Ints], gap_ns: int) -> dict[str, float]:
     """Return the mean step of each topic that has two steps or more up to `gap_ns`, without those of lost messages."""
     periods = {}
     for topic, times in moments.items():

@@ -39,11 +39,9 @@ METHODS: dict[str, Method] = {
         *ABLATIONS,
         FOLLOWER,
     )
-}
-"""By name. Recipes list the methods' tables, and results the settings in them, in this order."""
+}  # by name. Recipes list the methods' tables, and results the settings in them, in this order.
 
-ENTRY_POINTS = "astra_data.methods"
-"""The group of entry points under which installed packages offer methods."""
+ENTRY_POINTS = "astra_data.methods"  # the group of entry points under which installed packages offer methods
 _NAME = re.compile("[a-z][a-z0-9_]*")
 _PLACES: dict[str, str] = {}
 """Where the methods come from that are none of the package's, by name; in this process each name is one."""

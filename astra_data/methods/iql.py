@@ -337,5 +337,4 @@ BEHAVIOR_CLONING = replace(
 )
 DIRECT_TRANSFER_IQL = replace(
     IQL, name="direct_transfer_iql", title="Direct transfer + IQL", color="#7B3294", initial="direct_transfer"
-)
-"""Fits the critics while the policy is left as it is; then fine-tunes direct transfer's policy, gently."""
+)  # fits the critics while the policy is left as it is; then fine-tunes direct transfer's policy, gently

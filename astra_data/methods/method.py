@@ -24,8 +24,7 @@ class Table:
 
     name: str
     model: type[Config]
-    default: Config | None = None
-    """The settings where a recipe has no such table; None for those of the model."""
+    default: Config | None = None  # the settings where a recipe has no such table; None for those of the model
 
     @property
     def usual(self) -> Config:

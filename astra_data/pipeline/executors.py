@@ -31,32 +31,23 @@ from astra_data.core.provenance import cores
 from astra_data.core.seeding import derive
 
 SECONDS_BETWEEN_NOTES = 0.1
-CUDA_JOBS = 2
-"""Items at a time on a CUDA device, where each process has its own context."""
-Note = tuple[float, str]
-"""The fraction of an item that is done, and a remark."""
-Outcome = float | AstraDataError
-"""How long an item took, in s, or how it failed."""
-Event = Outcome | Note | None
-"""What happened to an item: it ended, or went on, or None: it started."""
-Watch = Callable[[str, Event], None]
-"""Is called with the key of an item and what happened to it."""
+CUDA_JOBS = 2  # items at a time on a CUDA device, where each process has its own context
+Note = tuple[float, str]  # the fraction of an item that is done, and a remark
+Outcome = float | AstraDataError  # how long an item took, in s, or how it failed
+Event = Outcome | Note | None  # what happened to an item: it ended, or went on, or None: it started
+Watch = Callable[[str, Event], None]  # is called with the key of an item and what happened to it
 
 
 @dataclass(frozen=True)
 class Item:
     """One artifact to make, in another process: `call` is picklable and takes `progress`."""
 
-    key: str
-    """Its name and its path in the run's folder: `<stage>/[<method>/]seed_<seed>`, or `report`."""
-    inputs: tuple[str, ...]
-    """Keys of the artifacts that it reads."""
+    key: str  # its name and its path in the run's folder: `<stage>/[<method>/]seed_<seed>`, or `report`
+    inputs: tuple[str, ...]  # keys of the artifacts that it reads
     call: Callable[..., object]
-    is_threaded: bool = False
-    """Whether `call` also takes `num_threads` and runs faster with more of them."""
+    is_threaded: bool = False  # whether `call` also takes `num_threads` and runs faster with more of them
     device: str = "cpu"
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    """What it is made with beside its inputs, as JSON."""
+    settings: Mapping[str, Any] = field(default_factory=dict)  # what it is made with beside its inputs, as JSON
 
     @property
     def stage(self) -> str:
@@ -291,13 +282,11 @@ def _serve(connection: Connection) -> None:
         connection.send(run_item(key, work, log, connection.send))
 
 
-GPU_SHARE = 0.5
-"""Share of a GPU for an item that computes on one: two of them keep their CUDA contexts on one GPU."""
+GPU_SHARE = 0.5  # share of a GPU for an item that computes on one: two of them keep their CUDA contexts on one GPU
 SETTINGS = {"RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0", "RAY_USAGE_STATS_ENABLED": "0", "RAY_worker_niceness": "0"}
 """Otherwise Ray makes `uv run` build an environment for every worker, sends usage statistics, and runs
 its workers at a lower priority than every other process."""
-PATIENCE_S = 10
-"""How long to wait for canceled tasks."""
+PATIENCE_S = 10  # how long to wait for canceled tasks
 
 
 def execute_on_cluster(

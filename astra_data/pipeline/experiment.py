@@ -38,10 +38,8 @@ from astra_data.reports.results import Results, read_results
 from astra_data.robots.registry import task_named
 from astra_data.worlds.commands import Commands
 
-ALWAYS_NEW = {"report"}
-"""Made by every run: it is cheap, and shows the rows and seeds that the recipe has now."""
-MADE_WITH = "made_with"
-"""The folder of a run for what its artifacts were made with."""
+ALWAYS_NEW = {"report"}  # made by every run: it is cheap, and shows the rows and seeds that the recipe has now
+MADE_WITH = "made_with"  # the folder of a run for what its artifacts were made with
 _MOST_KEYS, _MOST_LETTERS = 3, 60
 
 
@@ -266,10 +264,8 @@ def _check_fit(recipe: Recipe, base: Experiment, path: Path) -> None:
         raise RecipeError(f"{path} does not fit what it is based on: {'; '.join(faults)}")
 
 
-BEYOND = 0.05
-"""Share of the recorded range by which bounds may be wider without a warning."""
-TIMES = 20
-"""How many times as wide as the bounds the recorded range may be without a warning."""
+BEYOND = 0.05  # share of the recorded range by which bounds may be wider without a warning
+TIMES = 20  # how many times as wide as the bounds the recorded range may be without a warning
 
 
 @dataclass(frozen=True)

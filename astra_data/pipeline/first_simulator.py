@@ -19,10 +19,8 @@ from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import Column
 from astra_data.io.guessing import HEADING, PLACE, TURNED, Field, Logs
 
-JUDGED_STEPS = 10
-"""After so many steps a simulator should be better than standing still."""
-CLEARLY = 1.05
-"""Errors that are larger by less than this factor may be chance."""
+JUDGED_STEPS = 10  # after so many steps a simulator should be better than standing still
+CLEARLY = 1.05  # errors that are larger by less than this factor may be chance
 AXES = (("x", "y"), ("east", "north"), ("easting", "northing"), ("longitude", "latitude"), ("lon", "lat"))
 RATE = r"rate|vel(ocity)?|speed|dot"
 TURN_RATE = re.compile(
@@ -40,8 +38,7 @@ HEADINGS: tuple[tuple[re.Pattern[str], Sequence[str], str, str], ...] = (
     (HEADING, ("",), "of.cos({0})", "of.sin({0})"),
     (QUATERNION, "xyzw", "{3} ** 2 - {2} ** 2 + {0} ** 2 - {1} ** 2", "2 * {3} * {2} + 2 * {0} * {1}"),
     (QUATERNION, "zw", "{1} ** 2 - {0} ** 2", "2 * {1} * {0}"),
-)
-"""How a heading's names begin and end; its cosine and sine by these values."""
+)  # how a heading's names begin and end; its cosine and sine by these values
 SPEED = re.compile(
     rf"(?<![a-z])(v|d)(?=([xyz]|q|j|{TURNED}|roll|pitch|th|rot|ang|joint)(_|\d|$))|(?<=q)d(?=_?\d|$)|"
     rf"(^|_)({RATE})(?=_|\d|$)"
@@ -49,8 +46,7 @@ SPEED = re.compile(
 GENERIC = re.compile(
     r"(^|_)(pos(ition)?|pose|joints?|states?|odom|twist|linear|angular|torque|tau|effort|moment|force|angle|motor|"
     r"data|command|q|j|a|s|u)(?=_|\d|$)"
-)
-"""Words that do not tell one moving part of a robot from another."""
+)  # words that do not tell one moving part of a robot from another
 FORCES = ("N", "N m")
 DIRECT = "values that commands move"
 

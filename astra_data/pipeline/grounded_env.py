@@ -22,8 +22,7 @@ from astra_data.policies.simulator_env import Simulation, SimulatorEnv
 from astra_data.policies.train import InSimulator, Training
 from astra_data.robots.registry import task_named
 
-OPTIONS = ("data_start_share", "episode_steps")
-"""The keywords of an environment, keys of `[train]`."""
+OPTIONS = ("data_start_share", "episode_steps")  # the keywords of an environment, keys of `[train]`
 
 
 def grounded(run: str | Path, row: str, seed: int = 0, percent: int | None = None, **options: Any) -> SingleEnv:

@@ -98,8 +98,7 @@ def _refuse_folder(path: Path) -> None:
         raise RecipeError(f"{path} is {kind}: expected the recipe that made it{made_by}")
 
 
-WHOLE = 100
-"""Per cent: the size of a dataset that is not swept over."""
+WHOLE = 100  # per cent: the size of a dataset that is not swept over
 
 
 class SweepConfig(Config):

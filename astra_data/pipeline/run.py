@@ -41,8 +41,7 @@ from astra_data.reports.held_out import write_held_out
 from astra_data.robots.registry import TASKS, task_named
 from astra_data.worlds.walk_through import check_task
 
-SET_ASIDE = "set_aside"
-"""The folder of a run for artifacts that are made again: what took hours to make is not deleted."""
+SET_ASIDE = "set_aside"  # the folder of a run for artifacts that are made again: what took hours to make is not deleted
 POINTS = "sweep.csv"
 TIMED = {"ground": METRICS, "train": CURVE, "align": METRICS, "evaluate": EVALUATION}
 """Stages that are run for few points at once, and the file with the time that they took."""

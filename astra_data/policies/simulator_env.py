@@ -5,9 +5,9 @@ from typing import Literal
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from astra_data.core.arrays import Floats
 from astra_data.core.config import Config, NotNegative, Positive, Share
 from astra_data.grounding.failures import averages_before, failing
 from astra_data.grounding.history import HistoryGrounding
@@ -120,7 +120,7 @@ class SimulatorEnv:
             previous_action=starts.previous_action[moments],
         )
 
-    def _tensor(self, values: NDArray[np.float64]) -> Tensor:
+    def _tensor(self, values: Floats) -> Tensor:
         return torch.from_numpy(values).float().to(self.device)
 
     def step(self, action: Tensor) -> Step:

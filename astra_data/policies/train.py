@@ -86,8 +86,7 @@ def _learner(settings: object) -> str:
 AnyTrainConfig = Annotated[
     Annotated[PpoTrainConfig, Tag(choice("ppo"))] | Annotated[SacTrainConfig, Tag(choice("sac"))],
     Discriminator(_learner),
-]
-"""Training by the `learner` that is named, by default PPO."""
+]  # training by the `learner` that is named, by default PPO
 
 
 @dataclass(frozen=True)
@@ -168,16 +167,14 @@ def train_in(
     return learner.policy, optimize(learner, env, training)
 
 
-def optimize(
-    learner: Learner, env: TrainingEnv, training: Training, checkpoint_name: str = CHECKPOINT
-) -> dict[str, Any]:
+def optimize(learner: Learner, env: TrainingEnv, training: Training, checkpoint: str = CHECKPOINT) -> dict[str, Any]:
     """Train to the end, or on from the checkpoint; return the curve. A mastered simulator quickens what is left."""
 
     def go_on(state: dict[str, Any]) -> None:
         world = {name: values.to(training.device) for name, values in state["world"].items()}
         learner.load_state_dict(state["learner"], env.load_state_dict(world), goes_on=bool(world))
 
-    logbook = Logbook(training.folder / checkpoint_name, go_on)
+    logbook = Logbook(training.folder / checkpoint, go_on)
     points, stopwatch, first = logbook.points, logbook.stopwatch, learner.steps
     is_lasting = training.task.objective.is_lasting
     ramps = training.is_plus and isinstance(learner, Ppo) and not is_lasting

@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
+from astra_data.core.arrays import Floats
 from astra_data.core.artifact import check_intact
 from astra_data.core.config import read_written
 from astra_data.core.errors import BadInputError
@@ -191,7 +191,7 @@ def read_json[T: Artifact](model: type[T], path: Path) -> T:
     return read_written(model, path, by="its stage", advice="run that stage again")
 
 
-def read_tensors(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[np.float64]]:
+def read_tensors(path: Path, names: tuple[str, ...]) -> dict[str, Floats]:
     """Read a safetensors file that holds at least `names`, or raise a BadInputError."""
     from astra_data.core.checkpoint import load_tensors  # noqa: PLC0415 - figures of datasets do without torch
 

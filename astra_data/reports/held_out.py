@@ -119,9 +119,7 @@ def _size(results: Results, percent: int | None = None) -> list[str]:
     return ([f"{percent} %"] if percent else ["size"]) if results.is_swept else []
 
 
-def _error_lines(
-    results: Results, means: "pd.DataFrame", quantity: str, horizons: Sequence[int]
-) -> Iterator[list[str]]:
+def _error_lines(results: Results, means: "pd.DataFrame", quantity: str, horizons: list[int]) -> Iterator[list[str]]:
     """Yield a line for each simulator at a size; what all groundings share, once."""
     groundings = [row for row in results.groundings() if (row, "grounded") in means.index]
 

@@ -27,8 +27,7 @@ WORDS = {
     "rma": "RMA: rapid motor adaptation",
     "compass": "COMPASS: simulator parameters fitted to the episodes",
     "compass_uniform": "COMPASS, uniform: simulator parameters drawn from wide ranges",
-}
-"""What the names of methods stand for."""
+}  # what the names of methods stand for
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,6 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from numpy.typing import NDArray
 
 from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError
@@ -31,7 +30,7 @@ def observed(env: Env, observation: Any) -> State:  # noqa: ANN401 - whatever th
     return np.asarray(shown, dtype=np.float64)
 
 
-def as_given(command: NDArray[np.float64], state: State) -> NDArray[np.float64]:
+def as_given(command: Floats, state: State) -> Floats:
     """Return the command as the environment's action."""
     return command
 
@@ -67,7 +66,7 @@ class GymnasiumRobot:
         env_id: str | Callable[..., Env],
         *,
         read_state: Callable[[Env, Any], State] = observed,
-        command: Callable[[NDArray[np.float64], State], Any] = as_given,
+        command: Callable[[Floats, State], Any] = as_given,
         failed: Callable[[State, bool], bool] | None = None,
         **options: Any,
     ) -> None:
@@ -90,7 +89,7 @@ class GymnasiumRobot:
         self._state = self._read_state(self.env.unwrapped, observation)
         return self._state
 
-    def step(self, command: NDArray[np.float64]) -> tuple[State, bool]:
+    def step(self, command: Floats) -> tuple[State, bool]:
         """Apply `command` (A,), in its units; return the state (S,) one period later, and if it failed."""
         observation, _, terminated, _, _ = self.env.step(self._action(command))
         self._state = self._read_state(self.env.unwrapped, observation)
@@ -102,7 +101,7 @@ class GymnasiumRobot:
         for command in np.array([*limits.values()]).T:
             self._action(command)
 
-    def _action(self, command: NDArray[np.float64]) -> Any:  # noqa: ANN401 - whatever the environment takes
+    def _action(self, command: Floats) -> Any:  # noqa: ANN401 - whatever the environment takes
         action, space = self._command(command, self._state), self.env.action_space
         if not isinstance(space, gymnasium.spaces.Box):
             return action

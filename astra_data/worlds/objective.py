@@ -6,9 +6,9 @@ from typing import ClassVar
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from astra_data.core.arrays import Floats
 from astra_data.worlds.plane.mazes import Maze
 
 
@@ -72,10 +72,10 @@ class Objective(ABC):
         return (SURVIVED_STEPS, RETURN) if self.is_lasting else (SUCCESS,)
 
     @abstractmethod
-    def draw_starts(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+    def draw_starts(self, rng: np.random.Generator, count: int) -> Floats:
         """Draw states (count, X), at rest, where the task starts."""
 
-    def draw_goals(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+    def draw_goals(self, rng: np.random.Generator, count: int) -> Floats:
         """Draw goals (count, G); by default there is nothing to draw, G = 0."""
         return np.empty((count, 0))
 

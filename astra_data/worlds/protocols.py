@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from astra_data.core.arrays import Floats
 from astra_data.dataset.columns import Column
 
 
@@ -149,7 +150,7 @@ class TargetEnv(BatchedEnv, Protocol):
     def reseed(self, seed: int) -> None:
         """Restart the random numbers at `seed`."""
 
-    def reset_to(self, rows: NDArray[np.intp], state: NDArray[np.float64]) -> None:
+    def reset_to(self, rows: NDArray[np.intp], state: Floats) -> None:
         """Set the robots `rows` (n,) to `state` (n, S)."""
 
     def step(self, action: Tensor, active: Tensor | None = None) -> Step:

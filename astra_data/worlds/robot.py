@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import first_few
 from astra_data.core.seeding import derive, generator
@@ -27,7 +28,7 @@ class Robot(Protocol):
     def reset(self) -> State:
         """Bring the robot to where an episode starts; return its state (S,)."""
 
-    def step(self, command: NDArray[np.float64]) -> tuple[State, bool]:
+    def step(self, command: Floats) -> tuple[State, bool]:
         """Apply `command` (A,), in its units; return the state (S,) one period later, and if it failed."""
 
 
@@ -124,7 +125,7 @@ class RobotEnv:
             success=success,
         )
 
-    def reset_to(self, rows: NDArray[np.intp], state: NDArray[np.float64]) -> None:
+    def reset_to(self, rows: NDArray[np.intp], state: Floats) -> None:
         """Refuse with a BadInputError: a robot cannot be set to any state."""
         raise BadInputError("robots cannot be put into a recorded state: expected data_start_share = 0")
 

@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ABSTRACT_STATE, ACTION, GOAL, NEXT_STATE, STATE, Column
 from astra_data.dataset.description import NAME
@@ -152,7 +153,7 @@ class Task:
     simulator_id: str = ""
     varied: Varied = Varied(VariedCommands, RANDOMIZED_COMMANDS, RANDOMIZED_COMMANDS)
     plane: Plane | None = None
-    photograph: Callable[[NDArray[np.float64]], NDArray[np.uint8]] | None = None
+    photograph: Callable[[Floats], NDArray[np.uint8]] | None = None
     target_id: str | None = None
     derived: Mapping[str, Any] = field(default_factory=dict, repr=False, compare=False)
 

@@ -364,17 +364,15 @@ def compare_with_lerobot(root: Path, report: Report) -> None:
         logging.getLogger().handlers[:] = handlers  # those that lerobot adds put a prefix before our messages
 
 
-def _windows(
-    root: Path, columns: list[plain.PlainColumn], frames: int
-) -> Iterator[tuple[int, dict[str, Array], Array]]:
+def _windows(root: Path, columns: list[plain.PlainColumn], steps: int) -> Iterator[tuple[int, dict[str, Array], Array]]:
     """Yield rows, the windows around them clipped to their episodes, and the mask of clipped steps."""
-    wanted = set(np.linspace(0, frames - 1, WINDOWS).astype(int).tolist())
+    wanted = set(np.linspace(0, steps - 1, WINDOWS).astype(int).tolist())
     split = (names.EPISODE_INDEX, names.FRAME_INDEX)
     read = [*columns, *(plain.PlainColumn(name, "int64", 1) for name in split)]
     first = 0
     for run in _every_run(root, read):
         for row in sorted(wanted & set(range(first, first + len(run)))):
-            steps = row - first + OFFSETS
-            inside = np.clip(steps, 0, len(run) - 1)
-            yield row, {c.name: run.columns[c.name][inside] for c in columns}, steps != inside
+            places = row - first + OFFSETS
+            inside = np.clip(places, 0, len(run) - 1)
+            yield row, {c.name: run.columns[c.name][inside] for c in columns}, places != inside
         first += len(run)

@@ -109,11 +109,9 @@ def _name(path: Path) -> str:
     return "/".join(path.parts[-3:])
 
 
-def _every_run(
-    folder: Path, columns: Sequence[plain.PlainColumn], notes: list[str]
-) -> Iterator[tuple[plain.Run, bool]]:
+def _every_run(root: Path, columns: Sequence[plain.PlainColumn], notes: list[str]) -> Iterator[tuple[plain.Run, bool]]:
     """Yield each run, and whether the rows after it cannot be read."""
-    for path in plain.data_files(folder):
+    for path in plain.data_files(root):
         try:
             yield from _runs_of(path, columns, notes)
         except (*UNREADABLE, CorruptDatasetError) as error:

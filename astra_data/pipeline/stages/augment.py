@@ -23,6 +23,7 @@ import torch
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from astra_data.core.arrays import Bools
 from astra_data.core.config import AtOnce, Config, Count, NotNegative
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, silent
@@ -297,19 +298,17 @@ def _moving(source: Dataset) -> list[Column]:
     return [column for column in source.schema if column.dtype == "float32" and column.name not in still]
 
 
-def _shares(
-    source: Dataset, relocation: Relocation, config: AugmentConfig, seed: int
-) -> tuple[NDArray[np.bool_], NDArray[np.intp]]:
+def _shares(source: Dataset, mover: Relocation, config: AugmentConfig, seed: int) -> tuple[Bools, NDArray[np.intp]]:
     """Return which episodes are held out (E,), and how many copies each is to have (E,)."""
     count = len(source)
     training, held = held_out_episodes(count, config.held_out_share, seed)
     held_out = np.isin(np.arange(count), held)
     usable = ~held_out
     for index, episode in enumerate(source.episodes([STATE, NEXT_STATE])):
-        usable[index] &= bool(relocation.stretches(episode))
+        usable[index] &= bool(mover.stretches(episode))
     if not usable.any():
         raise BadInputError(
-            f"{source.reference}: none of {len(training)} training episodes keeps {relocation.margin_m:g} m "
+            f"{source.reference}: none of {len(training)} training episodes keeps {mover.margin_m:g} m "
             f"from the walls for {config.min_steps} steps: lower --margin-m, --min-steps or --held-out-share "
             f"({len(held)} episodes)"
         )

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, model_validator
 from torch import Tensor
 
-from astra_data.core.arrays import as_column
+from astra_data.core.arrays import Floats, Ints, as_column
 from astra_data.core.checkpoint import Logbook
 from astra_data.core.config import Config, Count, NotNegative, Share, in_order
 from astra_data.core.durable import file_digest
@@ -53,7 +53,7 @@ class WallWatch:
     def __init__(self, task: Task, clearance_m: float) -> None:
         self.clearance_m, self._task, self._maze = clearance_m, task, task.maze
 
-    def clearance(self, state: Tensor, commands: NDArray[np.float64]) -> NDArray[np.float64]:
+    def clearance(self, state: Tensor, commands: Floats) -> Floats:
         """Return the least clearance in m (B, K) if `commands` (B, K, A) are held from `state` (B, S)."""
         task, (count, choices, _) = self._task, commands.shape
         simulator = task.simulator(count * choices)
@@ -94,11 +94,11 @@ class RandomCommands:
         self._left -= 1
         return torch.from_numpy(self._command).float()
 
-    def _proposed(self, due: NDArray[np.intp], choices: int) -> NDArray[np.float64]:
+    def _proposed(self, due: NDArray[np.intp], choices: int) -> Floats:
         """Draw `choices` commands (n, K, A) for each of the robots `due` (n,)."""
         return self._rng.uniform(-1.0, 1.0, (len(due), choices, self._size))
 
-    def _times(self, count: int) -> NDArray[np.int64]:
+    def _times(self, count: int) -> Ints:
         """Draw for how many steps `count` commands are held, (count,)."""
         fewest, most = self._hold_steps
         return self._rng.integers(fewest, most + 1, count)
@@ -107,14 +107,14 @@ class RandomCommands:
 class StressCommands(RandomCommands):
     """Commands that seek failures: at the bounds, half of them reversed, held for log-uniform times."""
 
-    def _proposed(self, due: NDArray[np.intp], choices: int) -> NDArray[np.float64]:
+    def _proposed(self, due: NDArray[np.intp], choices: int) -> Floats:
         drawn = super()._proposed(due, choices)
         drawn /= np.abs(drawn).max(axis=-1, keepdims=True)
         before = self._command[due, None]
         is_reversed = (self._rng.random((len(due), choices, 1)) < 0.5) & before.any(axis=-1, keepdims=True)
         return np.where(is_reversed, -before, drawn)
 
-    def _times(self, count: int) -> NDArray[np.int64]:
+    def _times(self, count: int) -> Ints:
         fewest, most = self._hold_steps
         drawn = np.exp(self._rng.uniform(np.log(fewest), np.log(most + 1), count))
         return drawn.astype(np.int64).clip(fewest, most)
@@ -296,14 +296,11 @@ def _lasts(running: RunningPolicy, seed: int, num_threads: int | None) -> float:
     return lasted / _TEST_EPISODES
 
 
-_TRAINING_SHARE = 0.8
-"""Share of the progress bar for training the suboptimal policy."""
-_NUM_ENVS = 200
-"""Episodes recorded in one batch."""
+_TRAINING_SHARE = 0.8  # share of the progress bar for training the suboptimal policy
+_NUM_ENVS = 200  # episodes recorded in one batch
 _SAC_STEPS, _SAC_EPISODE_STEPS = 300_000, 500
 """SAC's training of a suboptimal policy stops after so many steps, or once test episodes last this long."""
-MOST_STEPS = 10**10
-"""Upper bound of the steps of a dataset; it would take terabytes."""
+MOST_STEPS = 10**10  # upper bound of the steps of a dataset; it would take terabytes
 
 
 class CollectConfig(Config):

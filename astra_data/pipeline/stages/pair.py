@@ -22,10 +22,8 @@ from astra_data.robots.registry import TASKS, Pairing, built, checked_abstractio
 from astra_data.worlds.protocols import AbstractSimulator
 from astra_data.worlds.user_code import expect_tensor, explained, stepped
 
-BATCH = 4096
-"""Simulators that are reset and stepped in one batch."""
-_BLOCK = 8 * BATCH
-"""Steps held in memory at once, rounded up to whole episodes."""
+BATCH = 4096  # simulators that are reset and stepped in one batch
+_BLOCK = 8 * BATCH  # steps held in memory at once, rounded up to whole episodes
 _log = logging.getLogger(__name__)
 
 

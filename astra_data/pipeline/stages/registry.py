@@ -31,14 +31,10 @@ class Stage:
     run: Callable[..., object]
     each: Literal["seed", "size", "grounding", "policy", "alignment", "row", "recipe"]
     """What it makes one artifact for; all but the seed, its sizes and the recipe once per dataset."""
-    reads: tuple[str, ...] = ()
-    """The stages whose artifacts it may read."""
-    config: Any = None
-    """The type of its table in a recipe; None where it has no settings."""
-    asked_by: str | None = None
-    """The key of recipes without which the stage is left out; None if all have it."""
-    result: str | None = None
-    """The file of its artifacts that other stages read; None for datasets and the report."""
+    reads: tuple[str, ...] = ()  # the stages whose artifacts it may read
+    config: Any = None  # the type of its table in a recipe; None where it has no settings
+    asked_by: str | None = None  # the key of recipes without which the stage is left out; None if all have it
+    result: str | None = None  # the file of its artifacts that other stages read; None for datasets and the report
 
     @property
     def makes_dataset(self) -> bool:
@@ -64,5 +60,4 @@ STAGES: dict[str, Stage] = {
         Stage("evaluate", evaluate, "row", ("train", "ground", "align"), EvaluateConfig, result=EVALUATION),
         Stage("report", report, "recipe", ("evaluate",), ReportConfig),
     )
-}
-"""In the order of the pipeline."""
+}  # in the order of the pipeline

@@ -208,7 +208,7 @@ _REST = [entry for entry in range(29) if entry not in _PLANAR]
 _JOINT_RATES = slice(-8, None)
 
 
-def ant_to_point_mass[Array: (NDArray[np.float32], NDArray[np.float64], Tensor)](state: Array) -> Array:
+def ant_to_point_mass[Array: (NDArray[np.float32], Floats, Tensor)](state: Array) -> Array:
     """Keep the torso's planar position in m and velocity in m/s: (..., 29) to [x, y, vx, vy] (..., 4)."""
     return state[..., _PLANAR]
 

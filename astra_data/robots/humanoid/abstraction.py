@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from astra_data.core.arrays import normalized
+from astra_data.core.arrays import Floats, normalized
 from astra_data.robots.humanoid import target as humanoid
 from astra_data.worlds.geometry import rotation
 
@@ -138,7 +138,7 @@ class Phi:
         self._of_tensors = of_tensors
         self.__name__, self.__doc__ = of_tensors.__name__, of_tensors.__doc__
 
-    def __call__[Array: (NDArray[np.float32], NDArray[np.float64], Tensor)](self, state: Array) -> Array:
+    def __call__[Array: (NDArray[np.float32], Floats, Tensor)](self, state: Array) -> Array:
         """Return φ of states (..., 47)."""
         if isinstance(state, Tensor):
             return self._of_tensors(state)

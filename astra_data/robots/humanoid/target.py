@@ -21,8 +21,7 @@ JOINTS = (
     *("left_hip_x", "left_hip_z", "left_hip_y", "left_knee"),
     *("right_shoulder1", "right_shoulder2", "right_elbow"),
     *("left_shoulder1", "left_shoulder2", "left_elbow"),
-)
-"""In the order of the state."""
+)  # in the order of the state
 COMMANDED = tuple(JOINTS.index(name) for name in ("left_hip_y", "left_knee", "right_hip_y", "right_knee"))
 """The commanded joints among all, in the order of actions."""
 FEET = ("left_foot", "right_foot")  # geoms that are spheres at the ends of the shins

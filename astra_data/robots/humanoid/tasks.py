@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from astra_data.core.arrays import normalized
+from astra_data.core.arrays import Floats, normalized
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ABSTRACT_STATE, ACTION, STATE
 from astra_data.robots.humanoid import abstraction
@@ -37,8 +37,7 @@ _LEG_M = (
     (-0.00902000647996384, -0.4649974000155199),
     (0.003063963232245122, -0.3829877440980478),
     (0.002959964480236801, -0.3699881600947197),
-)
-"""x and z from torso to hip, hip to knee and knee to foot of a stretched leg of the humanoid."""
+)  # x and z from torso to hip, hip to knee and knee to foot of a stretched leg of the humanoid
 
 
 def sole_clearance(pose: Tensor) -> Tensor:
@@ -238,14 +237,14 @@ class Walking(Objective):
         return normalized(state, state.new_tensor(self._standing), state.new_tensor(self.spread))
 
     @cached_property
-    def _standing(self) -> NDArray[np.float64]:
+    def _standing(self) -> Floats:
         return self.phi(np.array(humanoid.STANDING))
 
     @abstractmethod
     def velocity(self, before: Tensor, after: Tensor) -> Tensor:
         """Return the body's forward velocity in a step between states (B, X), (B,) in m/s."""
 
-    def draw_starts(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+    def draw_starts(self, rng: np.random.Generator, count: int) -> Floats:
         """Draw states (count, X) as the target does: almost upright and at rest."""
         return self.phi(self.locomotion.draw_starts(rng, count))
 
@@ -350,7 +349,7 @@ class VariedHumanoid(VariedSimulator):
         return self.state
 
 
-def photograph(states: NDArray[np.float64], *, height: int = 240, width: int = 200) -> NDArray[np.uint8]:
+def photograph(states: Floats, *, height: int = 240, width: int = 200) -> NDArray[np.uint8]:
     """Return a picture of each of the target states (K, 47), seen from its right, (K, height, width, 3)."""
     os.environ.setdefault("MUJOCO_GL", "egl")
     model = humanoid.humanoid_model()
@@ -415,13 +414,11 @@ def _humanoids(objective: Walking, num_envs: int, **options: Any) -> humanoid.Hu
     return humanoid.HumanoidEnv(objective.locomotion, num_envs, **options)
 
 
-def _task(
-    name: str, objective: Walking, kind: Kind, beyond: Callable[[Tensor], Tensor], quantities: Quantities
-) -> Task:
+def _task(name: str, walking: Walking, kind: Kind, beyond: Callable[[Tensor], Tensor], quantities: Quantities) -> Task:
     return Task(
         name=f"humanoid-{name}",
         instruction="walk forward without falling",
-        objective=objective,
+        objective=walking,
         make_target=_humanoids,
         target_id="humanoid",
         make_simulator=kind,

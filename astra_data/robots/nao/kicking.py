@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError
 from astra_data.worlds.geometry import turned
 from astra_data.worlds.plane.mazes import Maze
@@ -184,7 +184,7 @@ class Kicking(PlanarObjective):
     distance_m: tuple[float, float] = (0.4, 1.0)  # of the robot from the ball at the start
     behind_m: float = 0.2  # distance from the ball of the point behind it that the shaping reward leads to
 
-    def draw_starts(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+    def draw_starts(self, rng: np.random.Generator, count: int) -> Floats:
         """Draw states (count, 8) at rest: the ball in front of the goal, the robot around it."""
         ball = np.stack([rng.uniform(*self.ball_x_m, count), rng.uniform(*self.ball_y_m, count)], axis=1)
         angle, distance = rng.uniform(-np.pi, np.pi, count), rng.uniform(*self.distance_m, count)
@@ -192,11 +192,11 @@ class Kicking(PlanarObjective):
         rest = np.zeros_like(robot)
         return np.concatenate([robot, rest, ball, rest], axis=1)
 
-    def draw_anywhere(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+    def draw_anywhere(self, rng: np.random.Generator, count: int) -> Floats:
         """Draw states (count, 8) at rest with the robot near its ball, which it rarely meets from afar."""
         return replace(self, distance_m=_NEAR_M).draw_starts(rng, count)
 
-    def draw_goals(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+    def draw_goals(self, rng: np.random.Generator, count: int) -> Floats:
         """Return the middle of the goal line, (count, 2)."""
         return np.tile([self.goal_line_m, 0.0], (count, 1))
 

@@ -202,15 +202,13 @@ class BatchedNao:
         )
         self.reset(np.arange(num_robots), np.zeros((num_robots, 3)), rng)
 
-    def reset(
-        self, rows: NDArray[np.intp], poses: Floats, rng: np.random.Generator, ball: Floats | None = None
-    ) -> None:
-        """Set robots upright at `poses` (n, 3), with new traits, and balls at `ball` (n, 2), by default 1 m ahead."""
+    def reset(self, rows: NDArray[np.intp], pose: Floats, rng: np.random.Generator, ball: Floats | None = None) -> None:
+        """Set robots upright at `pose` (n, 3), with new traits, and balls at `ball` (n, 2), by default 1 m ahead."""
         walk.put_rows(self.traits, rows, walk.Traits.draw(self.spread, len(rows), rng))
         standing = walk.Gait.standing(len(rows), self._limits)
         walk.put_rows(self.gait, rows, standing)
         angles = walk.leg_angles(self._engine.feet(standing))
-        x, y, yaw = poses.T
+        x, y, yaw = pose.T
         qpos = np.tile(self.bodies.model.qpos0, (len(rows), 1))
         qpos[:, 0], qpos[:, 1] = x, y
         qpos[:, 2] = self._engine.style.hip_height_m + walk.HIP_OFFSET_Z_M

@@ -144,12 +144,12 @@ body. The estimate of the ball follows, if there is one."""
 _BALL = [STATE_SIZE + entry for entry in range(4)]
 
 
-def nao_to_point_mass[Array: (NDArray[np.float32], NDArray[np.float64], Tensor)](state: Array) -> Array:
+def nao_to_point_mass[Array: (NDArray[np.float32], Floats, Tensor)](state: Array) -> Array:
     """Keep a NAO's estimated position in m and planned velocity in m/s: (..., S) to [x, y, vx, vy] (..., 4)."""
     return state[..., _PLANAR]
 
 
-def nao_to_ball_agent[Array: (NDArray[np.float32], NDArray[np.float64], Tensor)](state: Array) -> Array:
+def nao_to_ball_agent[Array: (NDArray[np.float32], Floats, Tensor)](state: Array) -> Array:
     """Keep what `nao_to_point_mass` does, and the ball's estimated position and velocity: (..., 34) to (..., 8)."""
     return state[..., _PLANAR + _BALL]
 
@@ -272,7 +272,7 @@ class NaoEnv(PlanarTarget):
             self.sight.update(self.robots.ball, self.robots.pose, estimated, self._rng, moving)
         return self._judged(before, self.truth, self.robots.bodies.fallen)
 
-    def _body_command(self, velocity: Tensor, kick: NDArray[np.bool_] | None) -> Floats:
+    def _body_command(self, velocity: Tensor, kick: Bools | None) -> Floats:
         """Turn world-frame commands (B, 2) into forward, left and turning speed (B, 3): see `NaoEnv`."""
         command = velocity.clamp(-1.0, 1.0).double().numpy()
         x, y = (SPEED_M_S * command).T

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from astra_data.core.arrays import Floats
+from astra_data.core.arrays import Bools, Floats
 from astra_data.core.errors import BadInputError
 
 
@@ -42,7 +42,7 @@ class Maze:
             raise BadInputError(f"maze: {'; '.join(faults)}")
 
     @cached_property
-    def walls(self) -> NDArray[np.bool_]:
+    def walls(self) -> Bools:
         """The grid of walls, (rows, columns)."""
         return np.array([[cell == "1" for cell in row] for row in self.rows])
 
@@ -70,7 +70,7 @@ class Maze:
         return np.array([self.cell_center(row, column) for row, column in self.free_cells()])
 
     @cached_property
-    def fine_walls(self) -> NDArray[np.bool_]:
+    def fine_walls(self) -> Bools:
         """The walls on a grid of `fine_m`, indexed [y, x] from the lower left corner."""
         per_cell = round(self.scale / self.fine_m)
         return np.kron(self.walls[::-1], np.ones((per_cell, per_cell), dtype=bool)).astype(bool)

@@ -31,7 +31,7 @@ class PlanarObjective(Objective):
         return self.maze
 
     @abstractmethod
-    def draw_anywhere(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+    def draw_anywhere(self, rng: np.random.Generator, count: int) -> Floats:
         """Draw states (count, X), at rest, anywhere in the free space; where there is a ball, near it."""
 
     def limit_command(self, action: Tensor, limit: float) -> Tensor:
@@ -76,17 +76,17 @@ class Navigation(PlanarObjective):
     def _goal_distances(self) -> dict[torch.device, GoalDistance]:
         return {}
 
-    def draw_starts(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+    def draw_starts(self, rng: np.random.Generator, count: int) -> Floats:
         """Draw states [x, y, vx, vy] (count, 4) at rest around the usual starts."""
         position = self._around(self.maze.start, rng, count)
         offsets = np.array(self.start_offsets_m)
         return _at_rest(position + offsets[rng.integers(len(offsets), size=count)])
 
-    def draw_goals(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+    def draw_goals(self, rng: np.random.Generator, count: int) -> Floats:
         """Draw goals (count, 2) in m around the maze's goal cell."""
         return self._around(self.maze.goal, rng, count)
 
-    def draw_anywhere(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+    def draw_anywhere(self, rng: np.random.Generator, count: int) -> Floats:
         """Draw states [x, y, vx, vy] (count, 4) at rest, uniformly from the free space away from walls."""
         rows, columns = np.nonzero(self.maze.clearance_field > self.start_clearance_m)
         if not len(rows):
@@ -100,7 +100,7 @@ class Navigation(PlanarObjective):
         corner = np.stack([columns[chosen], rows[chosen]], axis=-1)
         return _at_rest((corner + within) * cell - self.maze.half_extent)
 
-    def _around(self, cell: tuple[int, int], rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+    def _around(self, cell: tuple[int, int], rng: np.random.Generator, count: int) -> Floats:
         noise = rng.normal(0.0, self.spread_m, (count, 2)).clip(-3 * self.spread_m, 3 * self.spread_m)
         return np.asarray(np.array(self.maze.cell_center(*cell)) + noise)
 
@@ -130,7 +130,7 @@ class Navigation(PlanarObjective):
         return self.meter_reward * self.progress(before, after, goal) + bonus
 
 
-def _at_rest(position: NDArray[np.float64]) -> NDArray[np.float64]:
+def _at_rest(position: Floats) -> Floats:
     return np.concatenate([position, np.zeros_like(position)], axis=1)
 
 
