@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from astra_data.dataset.edit import subset as subset
     from astra_data.dataset.frames import Frames as Frames
     from astra_data.dataset.reader import Dataset as Dataset
-    from astra_data.dataset.staging import StagedWriter as StagedWriter
     from astra_data.dataset.writer import DatasetWriter as DatasetWriter
+    from astra_data.dataset.writer import StagedWriter as StagedWriter
     from astra_data.io.hub.sharing import pull as pull
     from astra_data.io.hub.sharing import push as push
     from astra_data.methods import METHODS as METHODS
@@ -47,8 +47,7 @@ _NAMES = {
     "dataset.edit": ("merge", "subset"),
     "dataset.frames": ("Frames",),
     "dataset.reader": ("Dataset",),
-    "dataset.staging": ("StagedWriter",),
-    "dataset.writer": ("DatasetWriter",),
+    "dataset.writer": ("DatasetWriter", "StagedWriter"),
     "io.hub.sharing": ("pull", "push"),
     "methods": ("METHODS",),
     "pipeline.run": ("run",),

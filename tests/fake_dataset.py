@@ -23,8 +23,7 @@ from astra_data.dataset.columns import (
     Episode,
 )
 from astra_data.dataset.reader import Dataset
-from astra_data.dataset.staging import StagedWriter
-from astra_data.dataset.writer import DatasetWriter
+from astra_data.dataset.writer import DatasetWriter, StagedWriter
 
 COLUMNS = (
     Column(

@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 from typer.core import TyperArgument, TyperOption
 
-from astra_data.cli import datasets, recipes, sharing, starting
+from astra_data.cli import datasets, recipes, sharing
 from astra_data.core.durable import NO_FSYNC, disk_error
 from astra_data.core.errors import AstraDataError, missing_extra
 from astra_data.core.naming import in_lines
@@ -55,7 +55,7 @@ def _options(
 
 PANELS: dict[str, dict[str, Callable[..., None]]] = {
     "Recipes": {
-        "new robot --from logs/*.csv": starting.new,
+        "new robot --from logs/*.csv": recipes.new,
         "run recipes/quickstart.toml --until ground": recipes.run,
         "check recipes/quickstart.toml cart.py:TASK": recipes.check,
         "ground recipes/quickstart.toml --method astra": recipes.ground,
@@ -103,7 +103,7 @@ for panel, commands in PANELS.items():
         epilog = f"Example: astra-data {example}"
         app.command(example.split()[0], rich_help_panel=panel, epilog=epilog)(command)
 app.add_typer(
-    starting.app, name="recipes", help="List or copy the package's recipes and mappings.", rich_help_panel="Recipes"
+    recipes.shipped, name="recipes", help="List or copy the package's recipes and mappings.", rich_help_panel="Recipes"
 )
 
 

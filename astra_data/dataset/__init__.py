@@ -12,7 +12,6 @@ For training, `frames.Frames` holds columns as tensors and draws windows and tra
 """
 
 from astra_data.dataset.reader import Dataset
-from astra_data.dataset.staging import StagedWriter
-from astra_data.dataset.writer import DatasetWriter
+from astra_data.dataset.writer import DatasetWriter, StagedWriter
 
 __all__ = ["Dataset", "DatasetWriter", "StagedWriter"]

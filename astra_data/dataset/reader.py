@@ -17,28 +17,11 @@ from numpy.typing import NDArray
 from astra_data.core.arrays import Ints
 from astra_data.core.errors import BadInputError, CorruptDatasetError, in_short, optional
 from astra_data.core.naming import RECORD, first_few
+from astra_data.dataset import description as described
+from astra_data.dataset import format as layout
 from astra_data.dataset import plain
 from astra_data.dataset.cameras import Camera, clip_fault, decoded, read_cameras
 from astra_data.dataset.columns import RESERVED, SUCCESS, Array, Column, Episode, Scalar
-from astra_data.dataset.description import (
-    Digests,
-    alteration,
-    altered_columns,
-    altered_files,
-    full_name,
-    identity_of,
-    read_description,
-    read_digests,
-)
-from astra_data.dataset.format import (
-    CODEBASE_VERSION,
-    INFO_PATH,
-    METADATA_PATH,
-    OUR_FOLDER,
-    STATS_PATH,
-    SUBSETS_PATH,
-    TASKS_PATH,
-)
 from astra_data.dataset.lerobot_recording import RecordedFiles, declared_columns, open_recording
 from astra_data.dataset.parquet import read_arrays, read_blocks, rows_of, to_numpy
 from astra_data.dataset.statistics import ranges
@@ -96,7 +79,7 @@ class Dataset:
         root = Path(root)
         refuse_others(root)
         with explained(root):
-            is_ours = (root / OUR_FOLDER).is_dir() or not (root / INFO_PATH).is_file()
+            is_ours = (root / layout.OUR_FOLDER).is_dir() or not (root / layout.INFO_PATH).is_file()
             return cls(**(_read(root) if is_ours else open_recording(root)))
 
     @property
@@ -112,7 +95,7 @@ class Dataset:
     @property
     def reference(self) -> str:
         """Name and version, such as "antmaze-long-random-seed0@data-1.0.0"."""
-        return full_name(self.description)
+        return described.full_name(self.description)
 
     @property
     def content_hash(self) -> str:
@@ -122,7 +105,7 @@ class Dataset:
     @property
     def identity(self) -> dict[str, str]:
         """Name, version and hash, as the datasets made from this one list them among their parents."""
-        return identity_of(self.description)
+        return described.identity_of(self.description)
 
     def __len__(self) -> int:
         """Return the number of episodes E."""
@@ -209,9 +192,9 @@ class Dataset:
     def _statistics(self) -> dict[str, dict[str, Any]]:
         if self.recorded is not None:  # for which all values are read
             return ranges(self.blocks([column.name for column in self.schema]))
-        found = plain.read_object(self.root / STATS_PATH)
+        found = plain.read_object(self.root / layout.STATS_PATH)
         if isinstance(found, str):
-            raise CorruptDatasetError(f"{self.root}: {STATS_PATH} {found}; astra-data repair rebuilds it")
+            raise CorruptDatasetError(f"{self.root}: {layout.STATS_PATH} {found}; astra-data repair rebuilds it")
         return found
 
     def verify(self) -> list[str]:
@@ -247,9 +230,9 @@ class Dataset:
         return opened
 
     @cached_property
-    def digests(self) -> Digests:
+    def digests(self) -> described.Digests:
         """Those of the values as they were written, or as they were when a recording was opened."""
-        return self.recorded.digests if self.recorded else read_digests(self.root, self.features)
+        return self.recorded.digests if self.recorded else described.read_digests(self.root, self.features)
 
     def _verified(self, columns: Sequence[Column], chosen: Ints) -> Iterator[tuple[dict[str, Array], Ints]]:
         """Yield blocks of whole episodes and their indices; the first one with altered values raises."""
@@ -270,11 +253,11 @@ class Dataset:
     def alterations(self, block: Mapping[str, Array], indices: Ints) -> Iterator[str]:
         """Yield a sentence for each episode of a block that has other values than were written."""
         for episode, values in self._split(block, indices):
-            if altered := altered_columns(values, episode, self.digests):
+            if altered := described.altered_columns(values, episode, self.digests):
                 start = int(self.starts[episode])
                 file = int(np.searchsorted(self.file_starts, start, side="right")) - 1
                 row = start - int(self.file_starts[file])
-                yield alteration(altered, self.paths[file], row, int(self.lengths[episode]), episode)
+                yield described.alteration(altered, self.paths[file], row, int(self.lengths[episode]), episode)
 
     def specs(self, names: Sequence[str]) -> list[Column]:
         """Return the columns `names`."""
@@ -287,8 +270,8 @@ class Dataset:
 
 def _read(root: Path) -> dict[str, Any]:
     """Return the fields of `Dataset` of our dataset in folder `root`, and read the footers of its data files."""
-    description = read_description(root)
-    if altered := altered_files(root, description):
+    description = described.read_description(root)
+    if altered := described.altered_files(root, description):
         faults = (f"{path} {'was altered' if (root / path).exists() else 'missing'}" for path in altered)
         raise CorruptDatasetError("; ".join(faults))
     try:
@@ -299,7 +282,9 @@ def _read(root: Path) -> dict[str, Any]:
 
 def _parsed(root: Path, description: dict[str, Any]) -> dict[str, Any]:
     """Read what is sealed, and therefore as the writer wrote it, unless somebody forged it."""
-    info, subsets = (json.loads((root / path).read_text(encoding="utf-8")) for path in (INFO_PATH, SUBSETS_PATH))
+    info, subsets = (
+        json.loads((root / path).read_text(encoding="utf-8")) for path in (layout.INFO_PATH, layout.SUBSETS_PATH)
+    )
     if not plain.is_data_path(info["data_path"]):
         raise BadInputError(f"expected a path inside the dataset's folder, got {info['data_path']!r}")
     cameras, faults_of = read_cameras(root, info)
@@ -307,7 +292,7 @@ def _parsed(root: Path, description: dict[str, Any]) -> dict[str, Any]:
     columns = [Column.from_feature(name, feature) for name, feature in info["features"].items()]
     tables = pa.concat_tables(read_blocks(plain.episodes_files(root), _LOCATION))
     lengths, chunks, files = (to_numpy(tables.column(name), 1, "int64") for name in _LOCATION)
-    metadata = pa.concat_tables(read_blocks([root / METADATA_PATH])).to_pydict()
+    metadata = pa.concat_tables(read_blocks([root / layout.METADATA_PATH])).to_pydict()
     del metadata["length"]
     uids = metadata.pop("episode_uid")
     rows: dict[Path, int] = {}
@@ -328,7 +313,7 @@ def _parsed(root: Path, description: dict[str, Any]) -> dict[str, Any]:
         faults += [f"{name} {fault}" for fault in plain.schema_faults(footer[1], stored)]
     tasks = plain.read_tasks(root)
     if isinstance(tasks, str) or 0 not in tasks:
-        faults.append(f"{TASKS_PATH} {tasks if isinstance(tasks, str) else 'has no task 0'}")
+        faults.append(f"{layout.TASKS_PATH} {tasks if isinstance(tasks, str) else 'has no task 0'}")
     if faults:
         raise CorruptDatasetError("; ".join(faults))
     position = {uid: episode for episode, uid in enumerate(uids)}
@@ -409,11 +394,11 @@ def refuse_others(root: Path) -> None:
 
 def format_fault(root: Path) -> str | None:
     """Return a sentence if the dataset in `root` is LeRobot's and of another format than ours."""
-    info = plain.read_object(root / INFO_PATH)
-    version = info.get("codebase_version") if isinstance(info, dict) else CODEBASE_VERSION
-    if version == CODEBASE_VERSION or (root / OUR_FOLDER).is_dir():
+    info = plain.read_object(root / layout.INFO_PATH)
+    version = info.get("codebase_version") if isinstance(info, dict) else layout.CODEBASE_VERSION
+    if version == layout.CODEBASE_VERSION or (root / layout.OUR_FOLDER).is_dir():
         return None
-    found = f"{root} has LeRobot's format {version}, expected {CODEBASE_VERSION}"
+    found = f"{root} has LeRobot's format {version}, expected {layout.CODEBASE_VERSION}"
     if not plain.is_format_2(root):
         return f"{found}: convert it with a version of lerobot that reads both"
     return f"{found}: convert it with lerobot's convert_dataset_v21_to_v30, or {REPAIR.format(root)}"
@@ -421,7 +406,7 @@ def format_fault(root: Path) -> str | None:
 
 def refuse_versions(root: Path) -> None:
     """Raise BadInputError where `root` holds versions of a dataset; name them."""
-    versions = sorted(path.name for path in root.glob("data-*.*.*") if (path / INFO_PATH).is_file())
+    versions = sorted(path.name for path in root.glob("data-*.*.*") if (path / layout.INFO_PATH).is_file())
     if versions:
         raise BadInputError(f"{root} contains versions of a dataset: name one of {', '.join(versions)}.")
 
@@ -431,7 +416,7 @@ def refuse_run(root: Path) -> None:
     if not (root / RECORD).is_file():
         return
     places = ("*/seed_*", "*/percent_*/seed_*")
-    found = sorted(info.parents[1] for place in places for info in root.glob(f"{place}/{INFO_PATH}"))
+    found = sorted(info.parents[1] for place in places for info in root.glob(f"{place}/{layout.INFO_PATH}"))
     held = f"its datasets are {first_few(found, _SHOWN)}" if found else "it has no datasets yet"
     raise BadInputError(f"{root} is a run; {held}")
 
@@ -453,7 +438,7 @@ def explained(root: Path) -> Iterator[None]:
 
 def can_be_repaired(root: Path) -> bool:
     """Return whether columns and rate of the dataset in `root` are known, without which no value is."""
-    info = plain.read_object(root / INFO_PATH)
+    info = plain.read_object(root / layout.INFO_PATH)
     try:
         return not isinstance(info, str) and bool(declared_columns(root, info))
     except CorruptDatasetError:

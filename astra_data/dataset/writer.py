@@ -4,7 +4,7 @@ import json
 import shutil
 from array import array
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,23 +13,15 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from astra_data.core.durable import atomic_folder, file_digest
-from astra_data.core.errors import BadInputError, CorruptDatasetError, unmet
+from astra_data.core import durable
+from astra_data.core.errors import AstraDataError, BadInputError, CorruptDatasetError, DiskError, in_short, unmet
 from astra_data.dataset import columns as names
+from astra_data.dataset import description as described
 from astra_data.dataset import format as layout
 from astra_data.dataset.cameras import ClipWriter, images, pooled
 from astra_data.dataset.columns import Column, Episode, Scalar
-from astra_data.dataset.description import (
-    ContentHash,
-    complete_description,
-    digest_of,
-    permutation,
-    sealed,
-    write_digests,
-)
-from astra_data.dataset.format import METADATA_KEYS
-from astra_data.dataset.parquet import RotatingWriter, to_arrow
-from astra_data.dataset.plain import data_files, flag_faults, open_end_faults
+from astra_data.dataset.parquet import RotatingWriter, to_arrow, to_numpy
+from astra_data.dataset.plain import data_files, flag_faults, open_end_faults, read_object
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.statistics import EpisodeRows, episode_statistics, global_statistics
 
@@ -108,10 +100,10 @@ class DatasetWriter:
         images_of = [name for name, feature in self._cameras.items() if feature["dtype"] == "image"]
         self._schema = layout.data_schema(self._stored, images_of)
         self._fps, self._task, self._subset_seed, self._compression = fps, task, subset_seed, compression
-        self._description = complete_description(description)
+        self._description = described.complete_description(description)
         self.made: dict[str, Any] = {}
         self.policy: Path | None = None
-        self._hash = ContentHash()
+        self._hash = described.ContentHash()
         self._digests = {column.name: array("Q") for column in self._stored}
         self._frames = 0
         self._lengths: dict[int, int] = {}
@@ -128,7 +120,7 @@ class DatasetWriter:
     def __enter__(self) -> "DatasetWriter":
         """Start the hidden folder."""
         with ExitStack() as stack:
-            self._folder = stack.enter_context(atomic_folder(self.root))
+            self._folder = stack.enter_context(durable.atomic_folder(self.root))
             encodings = layout.data_encodings(self._stored)
             self._data = RotatingWriter(self._folder, layout.DATA_PATH, self._schema, encodings, self._compression)
             stack.callback(self._data.abandon)
@@ -185,7 +177,7 @@ class DatasetWriter:
         self._data.write(pa.Table.from_arrays(arrays, schema=self._schema))
         for name, column in values.items():
             self._hash.update(name, column)
-            self._digests[name].append(digest_of(column))
+            self._digests[name].append(described.digest_of(column))
         self._rows.append(length, chunk, file, episode_statistics(values.values()), pictures)
         self._frames += length
         self._lengths[episode.uid] = length
@@ -201,7 +193,7 @@ class DatasetWriter:
             raise BadInputError(f"{self.root}: no episodes were added; a dataset needs at least one.")
         episodes, uids = len(self._lengths), list(self._lengths)
         info = layout.dataset_info(self._stored, self._cameras, fps=self._fps, episodes=episodes, frames=self._frames)
-        order = permutation(uids, self._subset_seed)
+        order = described.permutation(uids, self._subset_seed)
         self._write_json(layout.INFO_PATH, info)
         stats = global_statistics(self._stored, self._frames, data_files(self._folder))
         for name in self._cameras:
@@ -216,12 +208,12 @@ class DatasetWriter:
         for key, kind_ in sorted(self._admission.metadata_types.items()):
             metadata[key] = pa.array([row.get(key) for row in self._metadata], _METADATA_TYPES[kind_])
         pq.write_table(pa.table(metadata), self._folder / layout.METADATA_PATH)
-        write_digests(self._folder, self._digests)
+        described.write_digests(self._folder, self._digests)
         description = self._description | self.made | {"content_hash": self.content_hash}
         if videos := sorted((self._folder / "videos").glob("*/*/*.mp4")):
-            described = {path.relative_to(self._folder).as_posix(): file_digest(path) for path in videos}
-            description |= {"videos": described}
-        self._write_json(layout.DATASET_PATH, sealed(self._folder, description))
+            digests = {path.relative_to(self._folder).as_posix(): durable.file_digest(path) for path in videos}
+            description |= {"videos": digests}
+        self._write_json(layout.DATASET_PATH, described.sealed(self._folder, description))
         if self.policy:
             shutil.copyfile(self.policy, self._folder / layout.POLICY_PATH)
         faults = Dataset.open(self._folder).verify()
@@ -271,7 +263,7 @@ class Admission:
             found, known = type(value), self.metadata_types.get(key, type(value))
             if found is not known:
                 faults.append(f"metadata {key}: {found.__name__}, earlier episodes have {known.__name__}")
-            if key in METADATA_KEYS:
+            if key in layout.METADATA_KEYS:
                 faults.append(f"metadata {key}: is filled in by the writer, leave it out")
             faults += _metadata_faults(key, value)
         flags = {name: values for name, values in episode.columns.items() if values.dtype == bool}
@@ -296,3 +288,228 @@ def _metadata_faults(key: str, value: Scalar) -> Iterator[str]:
         yield f"metadata {key}: {len(value):,} characters, expected at most {MOST_CHARACTERS:,}"
     elif isinstance(value, str) and not is_text(value):
         yield f"metadata {key}: {value!r:.80} has characters that are not valid Unicode"
+
+
+_SETTINGS = "plan.json"
+
+
+class StagedWriter:
+    """Writes a dataset whose episodes must not be lost, such as those of a robot.
+
+        with StagedWriter(root, columns, fps=20, task="walk", description=..., resume=True) as writer:
+            writer.add(episode)
+
+    An episode is safe when `add` returns. Leaving the block writes the dataset; after an exception or a kill
+    the episodes stay staged, and a writer with `resume` continues with them.
+
+    Attributes:
+        staged, lengths: metadata and steps of the staged episodes, by their position in the dataset.
+        made, policy: as in `DatasetWriter`.
+        folder: of the staged episodes, and of what else the recording needs to resume.
+
+    Example:
+        >>> from pathlib import Path
+        >>> import numpy as np
+        >>> from astra_data import Column, Dataset, Episode, StagedWriter
+        >>> columns = [Column("action", size=2)]
+        >>> recording = {"fps": 20, "task": "drive", "description": {"name": "log", "stage": "collect"}}
+        >>> with StagedWriter(Path("log"), columns, **recording, resume=True) as writer:
+        ...     writer.add(Episode(len(writer.staged), {"action": np.zeros((5, 2), np.float32)}))
+        >>> len(Dataset.open("log"))
+        1
+    """
+
+    def __init__(
+        self,
+        root: Path,
+        columns: Sequence[Column],
+        *,
+        fps: int,
+        task: str,
+        description: Mapping[str, Any],
+        subset_seed: int = 0,
+        resume: bool = False,
+    ) -> None:
+        """Prepare to record as `DatasetWriter` does; with `resume`, continue what was interrupted."""
+        settings = {"fps": fps, "task": task, "subset_seed": subset_seed}
+        self._writer = DatasetWriter(root, columns, **settings, description=description)  # type: ignore[arg-type]
+        self.root, self.folder = root, root.parent / f".{root.name}.staged"
+        self.made: dict[str, Any] = {}
+        self.policy: Path | None = None
+        self.staged: dict[int, Mapping[str, Scalar]] = {}
+        self.lengths: dict[int, int] = {}
+        self._columns, self._schema = list(columns), layout.data_schema(columns)
+        features = {column.name: column.feature() for column in columns}
+        self._settings = json.loads(json.dumps({"columns": features, "description": dict(description), **settings}))
+        self._resume, self._is_open = resume, False
+        self._admission, self._exit = Admission(columns), ExitStack()
+
+    def __enter__(self) -> "StagedWriter":
+        """Start or resume the recording."""
+        if self._holds_work() and not self._resume and not self.root.exists():
+            raise BadInputError(
+                f"{self.root}: an interrupted recording left {self._left()}; "
+                f"resume it (--resume), or delete {self.folder} to start again."
+            )
+        with durable.writing(self.folder), ExitStack() as stack:
+            stack.callback(durable.remove_empty, durable.make_folder(self.folder))
+            durable.sweep(self.root)
+            if not stack.enter_context(durable.held(self.folder)):
+                raise BadInputError(f"{self.root} is being recorded right now; wait or choose another folder.")
+            if self.root.exists():
+                if self._holds_work() and not self._is_written():
+                    raise BadInputError(
+                        f"{self.root} exists already and is another dataset than the interrupted recording, "
+                        f"which left {self._left()} in {self.folder}: move one of the two away."
+                    )
+                durable.discard(self.folder, self.root)  # a kill came between the dataset and this
+                durable.refuse_existing(self.root)
+            self._agree_on_the_settings()
+            for path in self._paths():
+                episode = load_staged(path, self._columns)
+                try:
+                    self._admission.admit(episode)
+                except BadInputError as error:
+                    raise BadInputError(f"{path}: {error} Delete it and resume the recording.") from error
+                self.staged[int(path.stem)], self.lengths[int(path.stem)] = episode.metadata, len(episode)
+            self._exit = stack.pop_all()
+        self._is_open = True
+        return self
+
+    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
+        """Write the dataset and remove the staged episodes; after an error, leave them to be resumed."""
+        self._is_open = False
+        with self._exit:
+            is_written = False
+            try:
+                if error is None:
+                    self._writer.made, self._writer.policy = self.made, self.policy
+                    with self._keeping(), self._writer:
+                        for position in sorted(self.staged):
+                            self._writer.add(load_staged(self._path(position), self._columns))
+                    is_written = True
+            finally:
+                with suppress(OSError):  # what stays is recognized by the next call
+                    if is_written or not self._holds_work():
+                        durable.discard(self.folder, self.root)
+
+    @contextmanager
+    def _keeping(self) -> Iterator[None]:
+        """Say how many episodes are safe if the disk fails."""
+        try:
+            yield
+        except DiskError as error:
+            safe = f"{len(self.staged)} episodes are safe in {self.folder}"
+            how = "a recipe goes on with them by itself, the command for a task with --resume."
+            raise DiskError(f"{error} {safe}: {how}") from error
+
+    def add(self, episode: Episode, position: int | None = None) -> None:
+        """Stage `episode` at `position`, by default after the last; a refused one changes nothing.
+
+        Raises:
+            BadInputError: it does not fit the columns, or the position is taken.
+            DiskError: it cannot be written; it may be added again.
+        """
+        if not self._is_open:
+            raise BadInputError(f"{self.root}: add episodes inside `with StagedWriter(...) as writer:`.")
+        place = max(self.staged, default=-1) + 1 if position is None else position
+        if place in self.staged:
+            raise BadInputError(f"Episode {episode.uid}: there is an episode {place} already.")
+        self._admission.admit(episode, keep=False)
+        path = self._path(place)
+        partial = path.with_suffix(".partial")
+        with self._keeping(), durable.writing(path):
+            write_staged(partial, episode, self._schema)
+            durable.sync(partial)
+            durable.move(partial, path)
+        self._admission.admit(episode)
+        self.staged[place], self.lengths[place] = episode.metadata, len(episode)
+
+    def drop(self, position: int) -> None:
+        """Leave out the staged episode at `position`; its uid stays taken."""
+        with durable.writing(self._path(position)):
+            self._path(position).unlink()
+        del self.staged[position], self.lengths[position]
+
+    def _holds_work(self) -> bool:
+        """Return whether there is anything to resume beside the settings."""
+        kept = (path for path in self.folder.glob("*") if not path.name.startswith("."))
+        return any(path.name != _SETTINGS and path.suffix != ".partial" for path in kept)
+
+    def _paths(self) -> list[Path]:
+        return sorted(self.folder.glob("*.arrow"))
+
+    def _left(self) -> str:
+        return f"{len(self._paths())} episodes" if self._paths() else "an unfinished recording"
+
+    def _is_written(self) -> bool:
+        """Return whether the dataset at `root` holds every staged episode, value for value."""
+        paths = self._paths()
+        try:
+            dataset = Dataset.open(self.root)
+            staged = {episode.uid: path for path in paths for episode in [load_staged(path, self._columns)]}
+            for stored in dataset.episodes([column.name for column in self._columns]) if staged else ():
+                if path := staged.pop(stored.uid, None):
+                    one = load_staged(path, self._columns)
+                    same = (np.array_equal(v, stored.columns[name]) for name, v in one.columns.items())
+                    if one.metadata != stored.metadata or not all(same):
+                        return False
+        except AstraDataError:
+            return False
+        settings = read_object(self.folder / _SETTINGS)
+        before = settings.get("description") if isinstance(settings, dict) else None
+        described = before if isinstance(before, dict) else self._settings["description"]
+        return not staged and (bool(paths) or described.items() <= dataset.description.items())
+
+    def _path(self, position: int) -> Path:
+        return self.folder / f"{position:06d}.arrow"
+
+    def _agree_on_the_settings(self) -> None:
+        """Write the settings, or check that what was staged was made with the same."""
+        before = read_object(self.folder / _SETTINGS)
+        if isinstance(before, dict):
+            if differing := ", ".join(key for key, *_ in described.changed_values(before, self._settings)):
+                raise BadInputError(
+                    f"{self.root}: the interrupted recording differs in {differing}; "
+                    f"resume it with the same settings, or delete {self.folder}."
+                )
+        elif self._holds_work():
+            raise BadInputError(
+                f"{self.folder} holds {self._left()}, but {_SETTINGS} {before}, so that nobody knows "
+                f"of which recording: delete the folder to start again."
+            )
+        else:
+            durable.write_file(self.folder / _SETTINGS, json.dumps(self._settings, indent=1, sort_keys=True))
+
+
+def write_staged(path: Path, episode: Episode, schema: pa.Schema) -> None:
+    """Write the columns of `schema`, with their digests, uid and metadata."""
+    facts = {
+        "uid": episode.uid,
+        "metadata": dict(episode.metadata),
+        "digests": {name: described.digest_of(episode.columns[name]) for name in schema.names},
+    }
+    arrays = [to_arrow(episode.columns[field.name], field.type) for field in schema]
+    schema = schema.with_metadata({"episode": json.dumps(facts)})
+    with path.open("wb") as sink, pa.ipc.new_file(sink, schema) as file:
+        file.write_table(pa.Table.from_arrays(arrays, schema=schema))
+
+
+def load_staged(path: Path, columns: Sequence[Column]) -> Episode:
+    """Return the episode in the file at `path`."""
+    try:
+        if not path.is_file():
+            raise OSError("it is no file")
+        with pa.memory_map(str(path)) as source, pa.ipc.open_file(source) as file:
+            table = file.read_all()
+            facts = json.loads(table.schema.metadata[b"episode"])
+            values = {c.name: to_numpy(table.column(c.name), c.size, c.dtype) for c in columns}
+            uid, metadata, digests = facts["uid"], facts["metadata"], facts["digests"]
+            altered = [name for name, digest in digests.items() if described.digest_of(values[name]) != digest]
+    except (OSError, pa.ArrowException, AttributeError, KeyError, TypeError, ValueError) as error:
+        raise CorruptDatasetError(
+            f"{path} is no whole episode ({in_short(error)}); delete it and resume the recording."
+        ) from error
+    if altered:
+        raise CorruptDatasetError(f"{path} was altered in {', '.join(altered)}; delete it and resume the recording.")
+    return Episode(uid, values, metadata)

@@ -13,9 +13,8 @@ from astra_data.cli.app import app
 from astra_data.core.errors import AstraDataError, BadInputError
 from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, REWARD, STATE, Column, Episode
 from astra_data.dataset.reader import Dataset
-from astra_data.dataset.staging import StagedWriter
 from astra_data.dataset.versions import open_dataset
-from astra_data.dataset.writer import DatasetWriter
+from astra_data.dataset.writer import DatasetWriter, StagedWriter
 from astra_data.pipeline.stages.augment import AugmentConfig
 from astra_data.robots import registry
 from astra_data.worlds import user_code

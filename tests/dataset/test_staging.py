@@ -16,7 +16,7 @@ from astra_data.core.errors import AstraDataError, BadInputError, CorruptDataset
 from astra_data.dataset import Dataset
 from astra_data.dataset.columns import Column, Episode
 from astra_data.dataset.format import data_schema
-from astra_data.dataset.staging import load_staged, write_staged
+from astra_data.dataset.writer import load_staged, write_staged
 
 STEPS_OF_THE_RECORDED = 20
 EPISODES_OF_THE_RECORDED = 30

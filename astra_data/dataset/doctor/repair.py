@@ -12,22 +12,11 @@ import numpy as np
 from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.dataset import columns as names
 from astra_data.dataset import format as layout
+from astra_data.dataset import lerobot_recording as lerobot
 from astra_data.dataset.cameras import Camera, clip_fault, read_cameras
 from astra_data.dataset.columns import Array, Column, Episode, Scalar, new_uid, renamed_metadata
 from astra_data.dataset.description import Digests, altered_files, read_description, read_digests
 from astra_data.dataset.doctor.salvage import whole_runs
-from astra_data.dataset.lerobot_recording import (
-    DTYPES,
-    Found,
-    Rows,
-    declared_columns,
-    found_in,
-    lacking,
-    left_out,
-    name_of,
-    our_columns,
-    robot_of,
-)
 from astra_data.dataset.plain import PlainColumn, Run, is_format_2, read_object, read_small_table, read_tasks
 from astra_data.dataset.reader import Dataset, refuse_run, refuse_versions
 from astra_data.dataset.statistics import Roundings
@@ -90,7 +79,7 @@ def repair(
         notes += [f"{renamed} episodes have new uids, because theirs were taken"] if renamed else []
     unknown = 0
     roundings = Roundings(remains.specs, {column.name: column.dtype for column in remains.columns})
-    recorded: list[Found] = []
+    recorded: list[lerobot.Found] = []
     theirs = {uid for source in sources for uid in source.uids.tolist()}
     task = " / ".join(str(tasks[index]) for index in sorted(tasks)) or "unknown"
     description, seed, cameras = _description(folder, remains, sources), remains.subset_seed, remains.cameras
@@ -107,7 +96,7 @@ def repair(
                 notes.append(f"left out the episode of uid {uid}: its values are not those in {references}")
                 continue
             if rows:
-                found = found_in(run, rows, tasks, row=0, uid=uid)
+                found = lerobot.found_in(run, rows, tasks, row=0, uid=uid)
                 recorded.append(found)
                 if not found.steps:
                     continue
@@ -130,7 +119,7 @@ def repair(
             result.episodes += 1
             result.frames += len(episode)
         if rows and recorded:
-            notes.append("; ".join(left_out(rows, recorded)))
+            notes.append("; ".join(lerobot.left_out(rows, recorded)))
         notes += [*roundings.found(), *remains.losses(result.episodes, writer.content_hash)]
         if (remains.metadata or sources) and unknown:
             notes.append(f"{unknown} episodes have no metadata: they are not among the known ones")
@@ -154,7 +143,7 @@ class Remains:
     fps: int
     tasks: Mapping[int, str]
     cameras: Mapping[str, Camera]
-    rows: Rows | None  # how its rows become ours, where LeRobot recorded it without next states; otherwise None
+    rows: lerobot.Rows | None  # how its rows become ours, where LeRobot recorded it without next states; else None
     subset_seed: int
     old: Mapping[str, Any] = field(default_factory=dict)  # its own description
     digests: Digests = field(default_factory=dict)
@@ -225,14 +214,14 @@ def remains_of(folder: Path, sources: Sequence[Dataset], notes: list[str]) -> Re
     info = read_object(folder / layout.INFO_PATH)
     if isinstance(info, str):
         raise CorruptDatasetError(f"{folder}: {layout.INFO_PATH} {info}; without it columns and fps are unknown")
-    columns, specs, fps = declared_columns(folder, info)
+    columns, specs, fps = lerobot.declared_columns(folder, info)
     if sources and names.EPISODE_UID not in info["features"]:
         raise BadInputError(f"{folder} has no column {names.EPISODE_UID}, by which it joins {sources[0].reference}")
-    tasks, rows = read_tasks(folder), Rows({column.name: column for column in columns}, fps)
+    tasks, rows = read_tasks(folder), lerobot.Rows({column.name: column for column in columns}, fps)
     has_ours = (folder / layout.OUR_FOLDER).is_dir()
-    is_ours = names.EPISODE_UID in rows.stored or has_ours or not rows.dropped or lacking(specs)
+    is_ours = names.EPISODE_UID in rows.stored or has_ours or not rows.dropped or lerobot.lacking(specs)
     if not is_ours:
-        specs = our_columns(specs, has_tasks=not isinstance(tasks, str) and len(tasks) > 1)
+        specs = lerobot.our_columns(specs, has_tasks=not isinstance(tasks, str) and len(tasks) > 1)
     if is_format_2(folder):
         notes.append(f"LeRobot's format {info['codebase_version']} became {layout.CODEBASE_VERSION}")
     cameras, unread = read_cameras(folder, info)
@@ -245,7 +234,7 @@ def remains_of(folder: Path, sources: Sequence[Dataset], notes: list[str]) -> Re
         notes.append(f"left out, because they are not numeric: {', '.join(others)}")
     kinds = {spec.name: spec.dtype for spec in specs}
     for column in columns:
-        kind = kinds.get(column.name, DTYPES[np.dtype(column.dtype).kind])
+        kind = kinds.get(column.name, lerobot.DTYPES[np.dtype(column.dtype).kind])
         if column.dtype != kind:
             notes.append(f"{column.name} was {column.dtype} and is now {kind}")
     if isinstance(tasks, str):
@@ -302,10 +291,10 @@ def _description(folder: Path, remains: Remains, sources: Sequence[Dataset]) -> 
     config, old = {"folder": folder.name}, sources[0].description if sources else remains.old
     if not old:
         return {
-            "name": name_of(folder),
+            "name": lerobot.name_of(folder),
             "stage": "repair",
             "config": config,
-            "environment": robot_of(remains.info),
+            "environment": lerobot.robot_of(remains.info),
         }
     parents = [other.identity for other in sources[1:]]
     return successor(old, "episodes", stage="repair", config=config, out=folder, parents=parents)[0]

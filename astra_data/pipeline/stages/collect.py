@@ -22,8 +22,8 @@ from astra_data.core.seeding import derive, generator
 from astra_data.dataset import columns as names
 from astra_data.dataset.columns import OUTCOME_COLUMNS, Array, Episode
 from astra_data.dataset.inspection import outcome_of
-from astra_data.dataset.staging import StagedWriter
 from astra_data.dataset.versions import home_of
+from astra_data.dataset.writer import StagedWriter
 from astra_data.grounding.files import GROUNDING, TARGET_ENCODER, grounding_at, load_target_encoder
 from astra_data.policies.episodes import ObservedTargetEnv
 from astra_data.policies.networks import ActorCritic, ActorCriticShape, PolicyShape, SoftActor

@@ -8,14 +8,7 @@ from typing import Literal
 from matplotlib.figure import Figure
 
 from astra_data.reports.blocks import Picture
-from astra_data.reports.figures.charts import (
-    data_efficiency,
-    learning_curves,
-    open_loop_error,
-    predictive_validity,
-    reliability,
-    score_bars,
-)
+from astra_data.reports.figures import charts
 from astra_data.reports.figures.motion import mismatch, strips, trajectories
 from astra_data.reports.figures.style import Scene, png
 from astra_data.reports.results import Results
@@ -34,14 +27,14 @@ class Drawing:
 
 _BARS = "Bars: means over seeds, also as numbers beside the names. Dots: single seeds. Lines: 95 % intervals."
 _DIAMONDS = (
-    " Diamonds: the same policies in the simulator of their training; the drop from diamond to bar is the "
+    f"{_BARS} Diamonds: the same policies in the simulator of their training; the drop from diamond to bar is the "
     "cost of the transfer."
 )
 
 FIGURES = {
-    "success": Drawing(partial(score_bars, measure="success"), "Success {where}", _BARS + _DIAMONDS, "methods"),
-    "steps": Drawing(partial(score_bars, measure="steps"), "Survived steps {where}", _BARS + _DIAMONDS, "methods"),
-    "return": Drawing(partial(score_bars, measure="return"), "Return {where}", _BARS, "methods"),
+    "success": Drawing(partial(charts.score_bars, measure="success"), "Success {where}", _DIAMONDS, "methods"),
+    "steps": Drawing(partial(charts.score_bars, measure="steps"), "Survived steps {where}", _DIAMONDS, "methods"),
+    "return": Drawing(partial(charts.score_bars, measure="return"), "Return {where}", _BARS, "methods"),
     "trajectories": Drawing(
         trajectories,
         "Trajectories",
@@ -60,7 +53,7 @@ FIGURES = {
         photo=True,
     ),
     "gap": Drawing(
-        open_loop_error,
+        charts.open_loop_error,
         "Open-loop error by horizon",
         "The simulator starts in a state of the target and receives the target's actions; the error is its "
         "distance from the target. Lower is better. Dotted: no grounding. Bands: 95 % intervals over the "
@@ -75,14 +68,14 @@ FIGURES = {
         "gap",
     ),
     "reliability": Drawing(
-        lambda results, _: reliability(rates) if (rates := results.failure_rates()) else None,
+        lambda results, _: charts.reliability(rates) if (rates := results.failure_rates()) else None,
         "Reliability of predicted failures",
         "On the dashed line, as many failures happen as are predicted; above it, more. Bottom: the number "
         "of steps with each prediction.",
         "failures",
     ),
     "validity": Drawing(
-        predictive_validity,
+        charts.predictive_validity,
         "Return in the simulators and in the target",
         "Each dot is one policy (a seed of a method), with its mean return over the episodes. On the dashed "
         "line, the simulator predicts the target's return exactly. For choosing between policies, it is "
@@ -90,14 +83,14 @@ FIGURES = {
         "validity",
     ),
     "data_efficiency": Drawing(
-        data_efficiency,
+        charts.data_efficiency,
         "Data efficiency",
         "Top, if shown: positions and velocities in the datasets of one seed; brighter means more often. "
         "Bottom: means over seeds by size of the dataset; bands: their 95 % intervals; dots: single seeds.",
         "sizes",
     ),
     "learning": Drawing(
-        learning_curves,
+        charts.learning_curves,
         "Learning curves",
         "Headline score of training episodes, in the simulator the policy is trained in. Lines: means over "
         "seeds, dashed with the plus settings. Bands: from the worst seed to the best. Many episodes "

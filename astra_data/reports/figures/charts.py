@@ -16,45 +16,35 @@ from astra_data.core.naming import artifact_key, base_method, is_plus
 from astra_data.dataset.inspection import Map, visited
 from astra_data.dataset.reader import Dataset
 from astra_data.methods import method_title
-from astra_data.reports.figures.style import (
-    FAINT,
-    INK,
-    Scene,
-    draw_band,
-    draw_visits,
-    look,
-    method_color,
-    score_axis,
-    style,
-)
+from astra_data.reports.figures import style
 from astra_data.reports.results import SIMULATED, TESTED, Results, titled
 from astra_data.reports.runs import SHARED_WORLDS
 
 CURVE_POINTS = 200  # points at which curves of different seeds are interpolated
 PANELS_ACROSS = 4  # learning-curve panels side by side, at most
-_DOT: dict[str, Any] = {"mfc": "white", "mec": INK, "clip_on": False}
+_DOT: dict[str, Any] = {"mfc": "white", "mec": style.INK, "clip_on": False}
 """Not clipped: the axis would cut what lies on 0 in half."""
 
 
-@style()
-def score_bars(results: Results, _: Scene, *, measure: str) -> Figure | None:
+@style.style()
+def score_bars(results: Results, _: style.Scene, *, measure: str) -> Figure | None:
     """Draw one bar per method, with a dot per seed, of the score with this measure; None for no score."""
     if not (scores := [score for score in results.scores if score.measure == measure]):
         return None
     score, rows = scores[0], results.tested()
     figure = Figure(figsize=(7.6, 0.9 + 0.38 * len(rows)), layout="constrained")
     axes = figure.add_subplot()
-    drawn: dict[str, Artist] = {"mean over seeds": Patch(fc=FAINT, ec="none")}
-    labels, drawn["95 % interval"] = [], Line2D([], [], color=INK, lw=1.6)
+    drawn: dict[str, Artist] = {"mean over seeds": Patch(fc=style.FAINT, ec="none")}
+    labels, drawn["95 % interval"] = [], Line2D([], [], color=style.INK, lw=1.6)
     for place, row in enumerate(rows):
         found, own = results.summary(row, measure), results.summary(row, measure, SIMULATED)
         # Beside the title, where no dot or diamond can stand in front of it or be taken for it.
         labels.append(f"{titled(row)}   {score.text(found.value) if found else '-'}")
         if found:
-            bar: dict[str, Any] = {"color": method_color(row), "hatch": "////" if is_plus(row) else None}
+            bar: dict[str, Any] = {"color": style.method_color(row), "hatch": "////" if is_plus(row) else None}
             axes.barh(place, found.value, height=0.68, lw=0, zorder=2, ec=(1, 1, 1, 0.4), **bar)
             if found.low is not None and found.high is not None:
-                axes.plot([found.low, found.high], [place, place], color=INK, lw=1.6, zorder=3)
+                axes.plot([found.low, found.high], [place, place], color=style.INK, lw=1.6, zorder=3)
             seeds = [*results.values(row, measure).values()]
             at = place + (np.linspace(-0.22, 0.22, len(seeds)) if len(seeds) > 1 else np.zeros(1))
             drawn["one seed"] = axes.plot(seeds, at, "o", mew=0.9, ms=3.5, zorder=4, **_DOT)[0]
@@ -71,8 +61,8 @@ def score_bars(results: Results, _: Scene, *, measure: str) -> Figure | None:
     return figure
 
 
-@style()
-def learning_curves(results: Results, _: Scene) -> Figure | None:
+@style.style()
+def learning_curves(results: Results, _: style.Scene) -> Figure | None:
     """Draw the headline score of training episodes over steps, by method: mean over seeds, band from worst to best."""
     curves = {}
     for row in results.rows:
@@ -96,8 +86,8 @@ def learning_curves(results: Results, _: Scene) -> Figure | None:
     for row, seeds in curves.items():
         axes = every[panels.index(base_method(row))]
         steps, scores = on_one_grid(seeds)
-        draw_band(axes, steps, scores.mean(axis=0), scores.min(0), scores.max(0), **look(row))
-    score_axis(every[0], results.headline)
+        style.draw_band(axes, steps, scores.mean(axis=0), scores.min(0), scores.max(0), **style.look(row))
+    style.score_axis(every[0], results.headline)
     every[0].set_xlim(0, max(float(steps[-1]) for seeds in curves.values() for steps, _ in seeds))
     every[0].xaxis.set(major_formatter=EngFormatter(), major_locator=MaxNLocator(4))
     figure.supxlabel("steps of training")
@@ -105,7 +95,7 @@ def learning_curves(results: Results, _: Scene) -> Figure | None:
     figure.supylabel(f"{results.headline.title} of training\nepisodes, from all starts")
     if any(map(is_plus, curves)):
         looks = {"without the plus settings": "-", "with the plus settings": "--"}
-        handles = [Line2D([], [], color=INK, ls=dashes, label=label) for label, dashes in looks.items()]
+        handles = [Line2D([], [], color=style.INK, ls=dashes, label=label) for label, dashes in looks.items()]
         figure.legend(handles=handles, loc="outside upper center", ncols=2, handlelength=2.4)
     return figure
 
@@ -118,8 +108,8 @@ def on_one_grid(seeds: Sequence[tuple[Floats, Floats]]) -> tuple[Floats, Floats]
     return grid, np.stack([np.interp(grid, steps, scores) for steps, scores in parts])
 
 
-@style()
-def data_efficiency(results: Results, scene: Scene) -> Figure | None:
+@style.style()
+def data_efficiency(results: Results, scene: style.Scene) -> Figure | None:
     """Draw the headline score over the size of the dataset, under what each size covers (the paper's figure)."""
     percents, score = results.percents, results.headline
     if len(percents) < 2:
@@ -134,7 +124,7 @@ def data_efficiency(results: Results, scene: Scene) -> Figure | None:
         panels = [first, *(figure.add_subplot(grid[line, k], **shared) for k in range(1, len(percents)))]
         most = max(int(visit.counts.max()) for visit in visits)  # all have the colors of the one that covers most
         for axes, visit, percent in zip(panels, visits, percents, strict=True):
-            draw_visits(axes, visit.counts, visit.extent, most)
+            style.draw_visits(axes, visit.counts, visit.extent, most)
             axes.tick_params(labelleft=axes is first, labelsize=6.5)
             axes.set_title("" if line else f"{percent} %")
         left, right, bottom, top = np.array([visit.extent for visit in visits]).T
@@ -144,19 +134,19 @@ def data_efficiency(results: Results, scene: Scene) -> Figure | None:
         every = {percent: results.score_of(row, TESTED, percent) for percent in percents}
         known = {percent: one for percent, one in every.items() if one}
         bands = np.array([(one.value, one.low, one.high) for one in known.values()], np.float64).T
-        draw_band(axes, np.array([*known]), *bands, marker="o", ms=4, **look(row))
+        style.draw_band(axes, np.array([*known]), *bands, marker="o", ms=4, **style.look(row))
         for percent in known:
             seeds = [*results.values(row, score.measure, TESTED, percent).values()]
-            axes.plot([percent] * len(seeds), seeds, ".", color=method_color(row), alpha=0.45, ms=4)
+            axes.plot([percent] * len(seeds), seeds, ".", color=style.method_color(row), alpha=0.45, ms=4)
     axes.set_xticks(percents, [f"{percent} %" for percent in percents])
     axes.set(xlabel="size of the dataset", ylabel=f"{score.quantity} {results.where}")
-    score_axis(axes, score)
+    style.score_axis(axes, score)
     handles, labels = axes.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=min(4, len(labels)))
     return figure
 
 
-def _covered(results: Results, scene: Scene) -> Mapping[str, list[Map]]:
+def _covered(results: Results, scene: style.Scene) -> Mapping[str, list[Map]]:
     """Return the visits of each size of the first seed that has all of them; empty without one."""
     roles = {"position (m)": "position", "velocity (m/s)": "vector"}
     for seed in results.seeds:
@@ -173,8 +163,8 @@ _UNITS = {"_m_s2": "m/s²", "_rad_s": "rad/s", "_m_s": "m/s", "_rad": "rad", "_d
 """Endings of the names of quantities."""
 
 
-@style()
-def open_loop_error(results: Results, _: Scene) -> Figure | None:
+@style.style()
+def open_loop_error(results: Results, _: style.Scene) -> Figure | None:
     """Draw the error over the horizon, one panel per quantity (named with its unit), on logarithmic axes."""
     if not results.errors:
         return None
@@ -192,10 +182,10 @@ def open_loop_error(results: Results, _: Scene) -> Figure | None:
             values = raw.to_numpy().T
             if not any(np.allclose(values, seen, rtol=SAME, equal_nan=True) for seen in drawn):
                 label = None if drawn else "no grounding"
-                draw_band(axes, raw.index, *values, color=INK, ls=":", label=label, marker="o", ms=3.5)
+                style.draw_band(axes, raw.index, *values, color=style.INK, ls=":", label=label, marker="o", ms=3.5)
                 drawn.append(values)
         for row, band in bands.items():
-            draw_band(axes, band.index, *band.to_numpy().T, **look(row), marker="o", ms=3.5)
+            style.draw_band(axes, band.index, *band.to_numpy().T, **style.look(row), marker="o", ms=3.5)
         ending = next((ending for ending in _UNITS if quantity.endswith(ending)), "")
         name = f"{quantity.removesuffix(ending).replace('_', ' ')} error"
         label = f"{name} ({_UNITS[ending]})" if ending else name
@@ -212,7 +202,7 @@ def open_loop_error(results: Results, _: Scene) -> Figure | None:
 _TICKS = (0.01, 0.1, 0.3, 0.6, 1.0)
 
 
-@style()
+@style.style()
 def reliability(parts: Mapping[str, Mapping[str, Floats]]) -> Figure:
     """Draw observed against predicted rates of `parts`, by their square roots, above the number of steps at each."""
 
@@ -223,11 +213,11 @@ def reliability(parts: Mapping[str, Mapping[str, Floats]]) -> Figure:
     above, below = figure.subplots(2, len(parts), squeeze=False, sharex=True, sharey="row", height_ratios=[2.6, 1.0])
     handles: dict[str, Line2D] = {}
     for (title, rates), axes, counts in zip(parts.items(), above, below, strict=True):
-        axes.plot([0, 1], [0, 1], color=FAINT, ls="--", lw=0.9, zorder=1)
+        axes.plot([0, 1], [0, 1], color=style.FAINT, ls="--", lw=0.9, zorder=1)
         for row, (predicted, observed, steps) in rates.items():
-            drawn = axes.plot(predicted, observed, marker="o", ms=4, clip_on=False, **look(row))
+            drawn = axes.plot(predicted, observed, marker="o", ms=4, clip_on=False, **style.look(row))
             handles.setdefault(method_title(row), drawn[0])
-            counts.plot(predicted, steps, marker="o", ms=4, **look(row))
+            counts.plot(predicted, steps, marker="o", ms=4, **style.look(row))
         axes.set_title(title, loc="left")
         for scale, set_ticks in ((axes.set_xscale, axes.set_xticks), (axes.set_yscale, axes.set_yticks)):
             scale("function", functions=(root, np.square))
@@ -242,8 +232,8 @@ def reliability(parts: Mapping[str, Mapping[str, Floats]]) -> Figure:
     return figure
 
 
-@style()
-def predictive_validity(results: Results, _: Scene) -> Figure | None:
+@style.style()
+def predictive_validity(results: Results, _: style.Scene) -> Figure | None:
     """Draw the return in the target against that in each simulator; on the dashed line they are equal."""
     worlds = [world for world in SHARED_WORLDS if any(line.where == world for line in results.lines)]
     if results.tested_in != "target" or not worlds:
@@ -253,12 +243,12 @@ def predictive_validity(results: Results, _: Scene) -> Figure | None:
     grid = figure.subplots(1, len(worlds), squeeze=False, sharey=True)[0]
     handles: dict[str, Line2D] = {}
     for axes, world in zip(grid, worlds, strict=True):
-        axes.axline((0, 0), slope=1, color=FAINT, ls="--", lw=0.9, zorder=1)
+        axes.axline((0, 0), slope=1, color=style.FAINT, ls="--", lw=0.9, zorder=1)
         for row in rows:
             target, there = results.values(row, "return"), results.values(row, "return", world)
             if shared := [seed for seed in there if seed in target]:
                 sides = ([of[seed] for seed in shared] for of in (there, target))
-                drawing = {"color": method_color(row), "mec": "white", "mew": 0.6, "ms": 6}
+                drawing = {"color": style.method_color(row), "mec": "white", "mew": 0.6, "ms": 6}
                 drawn = axes.plot(*sides, "^" if is_plus(row) else "o", **drawing)
                 handles[method_title(row)] = drawn[0]
         axes.set_title(f"{world} simulator".capitalize(), loc="left")

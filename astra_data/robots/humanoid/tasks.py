@@ -19,8 +19,6 @@ from torch.nn import functional
 from astra_data.core.arrays import Floats, normalized
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ABSTRACT_STATE, ACTION, STATE
-from astra_data.robots.humanoid import abstraction
-from astra_data.robots.humanoid import abstraction as phi
 from astra_data.robots.humanoid import target as humanoid
 from astra_data.worlds.objective import Objective
 from astra_data.worlds.simulators import ColdSteps, FreeStates
@@ -67,10 +65,10 @@ class HumanoidWalker2d(FreeStates):
         ],
         "torso, legs and foot contacts of a planar walker",
     )
-    abstraction = phi.humanoid_to_walker2d
+    abstraction = humanoid.humanoid_to_walker2d
 
     def __init__(self, num_envs: int, *, num_threads: int | None = None, device: str = "cpu") -> None:
-        standing = phi.humanoid_to_walker2d(torch.tensor(humanoid.STANDING))
+        standing = humanoid.humanoid_to_walker2d(torch.tensor(humanoid.STANDING))
         super().__init__(standing.repeat(num_envs, 1).to(device))
         self.memory = self._sunk(self.state)
         self.ranges = humanoid.CommandRanges()
@@ -137,7 +135,7 @@ class HumanoidKinematics(FreeStates):
 
     action_size = 4
     abstract_state = column(ABSTRACT_STATE, _JOINTS, "angles and rates of all joints")
-    abstraction = phi.humanoid_to_kinematics
+    abstraction = humanoid.humanoid_to_kinematics
 
     ranges = humanoid.CommandRanges()  # joint angles of commands
 
@@ -185,7 +183,7 @@ class HumanoidExtendedKinematics(HumanoidKinematics):
         "angles and rates of all joints; along the heading, centre of mass, from between the feet, "
         "and its velocity; which way is up from the torso, and how fast it turns",
     )
-    abstraction = phi.humanoid_to_extended_kinematics
+    abstraction = humanoid.humanoid_to_extended_kinematics
 
     def __init__(self, num_envs: int, *, follow_s: float = 0.3, device: str = "cpu") -> None:
         """Build B standing humanoids; `follow_s` is the time constant of the body's velocity and angular velocity."""
@@ -200,8 +198,8 @@ class HumanoidExtendedKinematics(HumanoidKinematics):
     def _moved(self, action: Tensor) -> Tensor:
         """Return joints, center of mass and its velocity, lean and spin (B, 46) after the step."""
         joints = super()._moved(action)
-        mass, feet = phi.mass_and_feet(self.state[:, :_COUNT])
-        later_mass, later_feet = phi.mass_and_feet(joints[:, :_COUNT])
+        mass, feet = humanoid.mass_and_feet(self.state[:, :_COUNT])
+        later_mass, later_feet = humanoid.mass_and_feet(joints[:, :_COUNT])
         aside = (later_mass - later_feet.mean(1)) - (mass - feet.mean(1))
         stance = feet[..., 2].argmin(dim=-1)
         rows = torch.arange(len(feet), device=feet.device)
@@ -226,7 +224,7 @@ class Walking(Objective):
     action_size = len(humanoid.COMMANDED)
     is_lasting = True
     spread: ClassVar[tuple[float, ...]]  # typical deviation of each entry of a state from standing, (X,)
-    phi: ClassVar[abstraction.Phi]  # φ of target states (count, 47), (count, X)
+    phi: ClassVar[humanoid.Phi]  # φ of target states (count, 47), (count, X)
 
     locomotion: humanoid.Locomotion = field(default_factory=humanoid.Locomotion)  # rewards and starts of the target
     failure_reward: float = field(default=-5.0, kw_only=True)
@@ -267,7 +265,7 @@ class PlanarWalking(Walking):
         *(humanoid.VELOCITY_M_S, humanoid.VELOCITY_M_S, humanoid.SPIN_RAD_S, *_LEG_RATES_RAD_S),
         *(1.0, 1.0),
     )
-    phi = abstraction.humanoid_to_walker2d
+    phi = humanoid.humanoid_to_walker2d
 
     def missed(self, state: Tensor, goal: Tensor) -> Tensor:
         """Return which torsos of states (B, 15) are outside of the healthy heights, (B,) bool."""
@@ -278,8 +276,8 @@ class PlanarWalking(Walking):
         """Return the forward velocity of the center of mass after the step, with stiff arms, (B,) in m/s."""
         joints = after.new_zeros(2, len(after), _COUNT)
         joints[..., humanoid.COMMANDED] = torch.stack([after[:, 2:6], after[:, 9:13]])
-        mass, _ = abstraction.mass_and_feet(joints[0])
-        swept = abstraction.mass_velocity(*joints)
+        mass, _ = humanoid.mass_and_feet(joints[0])
+        swept = humanoid.mass_velocity(*joints)
         pitch, pitch_rate = after[:, 1], after[:, 8]
         forward, up = swept[:, 0] + pitch_rate * mass[:, 2], swept[:, 2] - pitch_rate * mass[:, 0]
         return after[:, 6] + torch.cos(pitch) * forward + torch.sin(pitch) * up
@@ -290,11 +288,11 @@ class JointWalking(Walking):
     """Walking of the joints alone, states (..., 34); they show no falls, so every episode succeeds."""
 
     spread = (*humanoid.JOINTS_RAD, *humanoid.JOINT_RATES_RAD_S)
-    phi = abstraction.humanoid_to_kinematics
+    phi = humanoid.humanoid_to_kinematics
 
     def velocity(self, before: Tensor, after: Tensor) -> Tensor:
         """Return the velocity of a level torso over its lower foot, which does not slip, (B,) in m/s."""
-        feet, later = (abstraction.mass_and_feet(state[:, :_COUNT])[1] for state in (before, after))
+        feet, later = (humanoid.mass_and_feet(state[:, :_COUNT])[1] for state in (before, after))
         rows = torch.arange(len(feet), device=feet.device)
         lower = feet[..., 2].argmin(dim=-1)
         return (feet[rows, lower, 0] - later[rows, lower, 0]) / humanoid.TIMESTEP_S
@@ -308,7 +306,7 @@ class MassWalking(Walking):
         *(*JointWalking.spread, *[humanoid.POSITION_M] * 3, *[humanoid.VELOCITY_M_S] * 3),
         *(*[humanoid.LEAN_RAD] * 3, *[humanoid.SPIN_RAD_S] * 3),
     )
-    phi = abstraction.humanoid_to_extended_kinematics
+    phi = humanoid.humanoid_to_extended_kinematics
 
     lowest_mass_m: float = 0.65
     """A humanoid whose center of mass is lower has fallen, on average two steps before the target's episode
@@ -438,15 +436,15 @@ def _task(name: str, walking: Walking, kind: Kind, beyond: Callable[[Tensor], Te
 
 
 WALKER2D = _task(
-    "walker2d", PlanarWalking(horizon=_HORIZON), HumanoidWalker2d, abstraction.beyond_walker2d, _WALKER_QUANTITIES
+    "walker2d", PlanarWalking(horizon=_HORIZON), HumanoidWalker2d, humanoid.beyond_walker2d, _WALKER_QUANTITIES
 )
 KINEMATICS = _task(
-    "kinematics", JointWalking(horizon=_HORIZON), HumanoidKinematics, abstraction.beyond_kinematics, _JOINT_QUANTITIES
+    "kinematics", JointWalking(horizon=_HORIZON), HumanoidKinematics, humanoid.beyond_kinematics, _JOINT_QUANTITIES
 )
 EXTENDED = _task(
     "extended",
     MassWalking(horizon=_HORIZON),
     HumanoidExtendedKinematics,
-    abstraction.beyond_extended_kinematics,
+    humanoid.beyond_extended_kinematics,
     _JOINT_QUANTITIES | _BODY_QUANTITIES,
 )

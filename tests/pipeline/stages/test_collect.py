@@ -16,7 +16,7 @@ from astra_data.core.progress import silent
 from astra_data.dataset.columns import ACTION, DONE, NEXT_STATE, REWARD, STATE, SUCCESS, TERMINATED, TRUNCATED, Episode
 from astra_data.dataset.doctor.check import check
 from astra_data.dataset.reader import Dataset
-from astra_data.dataset.staging import StagedWriter
+from astra_data.dataset.writer import StagedWriter
 from astra_data.pipeline.stages import collect as stage
 from astra_data.pipeline.stages import collect as suboptimal
 from astra_data.pipeline.stages.collect import CollectConfig, WallWatch, collect, record

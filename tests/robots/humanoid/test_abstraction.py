@@ -4,12 +4,14 @@ import pytest
 import torch
 
 from astra_data.core.arrays import Floats
-from astra_data.robots.humanoid.abstraction import (
+from astra_data.robots.humanoid.target import (
+    COMMANDED,
+    FEET,
+    humanoid_model,
     humanoid_to_extended_kinematics,
     humanoid_to_kinematics,
     humanoid_to_walker2d,
 )
-from astra_data.robots.humanoid.target import COMMANDED, FEET, humanoid_model
 
 MODEL = humanoid_model()
 ALL = (humanoid_to_walker2d, humanoid_to_kinematics, humanoid_to_extended_kinematics)

@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from astra_data.core.arrays import Floats
-from astra_data.robots.humanoid.abstraction import humanoid_to_walker2d
 from astra_data.robots.humanoid.target import (
     COMMANDED,
     CONTACT_M,
@@ -17,6 +16,7 @@ from astra_data.robots.humanoid.target import (
     HumanoidEnv,
     Locomotion,
     humanoid_model,
+    humanoid_to_walker2d,
 )
 from astra_data.robots.humanoid.tasks import (
     HumanoidExtendedKinematics,
