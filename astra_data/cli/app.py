@@ -79,6 +79,7 @@ PANELS: dict[str, dict[str, Callable[..., None]]] = {
         "filter walks --success": datasets.filter_,
         "trim logs --start 2 --without 'v < 0.05'": datasets.trim,
         "resample logs --fps 20": datasets.resample,
+        "features logs --camera front": datasets.features,
         "list": datasets.list_,
         "inspect walks --plot figures": datasets.inspect,
         "validate walks@data-1.0.0": datasets.validate,

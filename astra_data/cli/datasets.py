@@ -126,6 +126,28 @@ def resample(
     _report(write(open_dataset(dataset), fps, name=name, out=out))
 
 
+def features(
+    dataset: arguments.DatasetName,
+    camera: Annotated[str, typer.Option(help="A camera, such as front for observation.images.front.")],
+    encoder: Annotated[
+        str | None,
+        typer.Option(metavar="FILE.py:NAME", help="Your encoder; its code is run.", show_default="one of the package"),
+    ] = None,
+    name: arguments.NewName = None,
+    out: arguments.Out = None,
+) -> None:
+    """Write a dataset with a column of what a frozen encoder makes of a camera's pictures."""
+    from astra_data.dataset.versions import open_dataset
+    from astra_data.grounding.features import DEFAULT
+    from astra_data.grounding.features import features as write
+    from astra_data.pipeline.display import shown
+
+    source = open_dataset(dataset)
+    with shown("features") as progress:
+        folder = write(source, camera, encoder or DEFAULT, name=name, out=out, progress=progress)
+    _report(folder)
+
+
 def _report(folder: Path) -> None:
     from astra_data.dataset.reader import Dataset
     from astra_data.dataset.versions import home_of, versions_at_home

@@ -208,12 +208,18 @@ def images(clip: Clip) -> list[dict[str, Any]]:
 
 def decoded(clip: Clip) -> NDArray[Any]:
     """Return the pictures of a clip, (T, H, W, 3) uint8; those of a depth camera are (T, H, W) uint16."""
+    return np.stack(list(pictures_of(clip)))
+
+
+def pictures_of(clip: Clip) -> Iterator[NDArray[Any]]:
+    """Yield the pictures of a clip one by one, as `decoded` has them."""
     if clip.path.suffix == ".mp4":
         kinds = {"gray10le": "gray16le", "gray12le": "gray16le", "gray16le": "gray16le"}  # of depth cameras
-        return np.stack([frame.to_ndarray(format=kinds.get(frame.format.name, "rgb24")) for frame in _decode(clip)])
+        yield from (frame.to_ndarray(format=kinds.get(frame.format.name, "rgb24")) for frame in _decode(clip))
+        return
     from PIL import Image  # noqa: PLC0415 - slow
 
-    return np.stack([np.asarray(Image.open(io.BytesIO(one["bytes"]))) for one in images(clip)])
+    yield from (np.asarray(Image.open(io.BytesIO(one["bytes"]))) for one in images(clip))
 
 
 def _decode(clip: Clip) -> Iterator[Any]:

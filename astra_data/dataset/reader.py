@@ -165,10 +165,13 @@ class Dataset:
 
     def pictures(self, camera: str, episode: int) -> NDArray[Any]:
         """Return the decoded pictures of an episode, by index: (T, H, W, 3) uint8, or (T, H, W) uint16 of depths."""
-        if camera not in self.cameras:
-            known = ", ".join(self.cameras) or "none"
-            raise BadInputError(f"{self.reference} has no camera {camera!r}; it has {known}")
-        return decoded(self.cameras[camera].clips[self.selected([episode])[0]])
+        return decoded(self.camera(camera).clips[self.selected([episode])[0]])
+
+    def camera(self, name: str) -> Camera:
+        """Return the camera `name`."""
+        if name not in self.cameras:
+            raise BadInputError(f"{self.reference} has no camera {name!r}; it has {', '.join(self.cameras) or 'none'}")
+        return self.cameras[name]
 
     def successes(self) -> list[bool | None] | None:
         """Return whether each episode succeeded, by metadata or next.success; None where or if it is unknown."""
