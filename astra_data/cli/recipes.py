@@ -100,7 +100,6 @@ def _check_task(name: str) -> None:
 
 
 def _of_networks(stage: str, summary: str) -> Callable[..., None]:
-    """Return the command of a stage that fits networks."""
 
     def command(
         recipe: arguments.RecipePath,

@@ -138,7 +138,6 @@ def _to_json(value: Nested, tensors: dict[str, Tensor]) -> Any:  # noqa: ANN401 
 
 
 def _from_json(state: Any, tensors: Mapping[str, Tensor]) -> Any:  # noqa: ANN401 - a training state
-    """Return the training state that `_to_json` was given."""
     match state:
         case {"tensor": name}:
             return tensors[name]

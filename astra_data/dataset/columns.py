@@ -78,7 +78,6 @@ class Column:
     astra: Mapping[str, list[str]] | None = None
 
     def __post_init__(self) -> None:
-        """Validate the column."""
         size, names, astra = self.size, self.names, self.astra or {}
         words = astra.get("role", [])
         unknown = ", ".join(sorted(set(words) - set(ROLES)))
@@ -238,11 +237,9 @@ class Episode:
             raise BadInputError(f"Episode {self.uid}: {'; '.join(faults)}.")
 
     def __len__(self) -> int:
-        """Return T."""
         return len(next(iter(self.columns.values())))
 
     def __repr__(self) -> str:
-        """Show shapes and dtypes instead of values."""
         shapes = ", ".join(f"{name} {values.shape} {values.dtype}" for name, values in self.columns.items())
         return f"Episode(uid={self.uid}, {shapes}, metadata={dict(self.metadata)})"
 

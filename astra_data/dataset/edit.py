@@ -171,7 +171,6 @@ def merge(
 
 
 def _write(source: Dataset, kept: set[int], *, seed: int | None = None, **described: Any) -> Path:
-    """Write the episodes `kept` as the next version, `described` as `next_version` takes it."""
     if not kept:
         raise BadInputError(f"{source.reference}: none of its {len(source)} episodes would be left")
     with next_version(source, "episodes", subset_seed=seed, **described) as writer:

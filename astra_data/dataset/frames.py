@@ -186,7 +186,6 @@ class Frames:
         return cls(columns, torch.from_numpy(starts).to(storage), torch.from_numpy(lengths).to(storage), target)
 
     def __len__(self) -> int:
-        """Return the number of steps of all episodes."""
         return int(self.lengths.sum())
 
     def __repr__(self) -> str:

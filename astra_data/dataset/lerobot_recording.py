@@ -140,7 +140,6 @@ def declared_columns(folder: Path, info: Mapping[str, Any]) -> tuple[list[PlainC
 
 
 def _fits(stored: PlainColumn, own: Column) -> bool:
-    """Return whether a column can be one of LeRobot's own."""
     return stored.size == 1 and np.dtype(stored.dtype).kind in ("f" if own.dtype == "float32" else "iu")
 
 

@@ -108,11 +108,9 @@ class Dataset:
         return described.identity_of(self.description)
 
     def __len__(self) -> int:
-        """Return the number of episodes E."""
         return len(self.lengths)
 
     def __repr__(self) -> str:
-        """Show name, version, size and columns."""
         columns = ", ".join([*(f"{c.name} ({c.size}) {c.dtype}" for c in self.schema), *self.cameras])
         return f"Dataset({self.reference}, {len(self)} episodes, {self.lengths.sum()} steps, {columns})"
 

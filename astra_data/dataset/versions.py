@@ -60,7 +60,6 @@ class Version:
         return cls.parse(tag[5:]) if re.fullmatch(f"data-{VERSION.pattern}", tag) else None
 
     def __str__(self) -> str:
-        """Write "1.2.0"."""
         return f"{self.major}.{self.minor}.{self.patch}"
 
     def next(self, change: Change, taken: Iterable["Version"] = ()) -> "Version":

@@ -118,7 +118,6 @@ class DatasetWriter:
         return self._hash.hexdigest()
 
     def __enter__(self) -> "DatasetWriter":
-        """Start the hidden folder."""
         with ExitStack() as stack:
             self._folder = stack.enter_context(durable.atomic_folder(self.root))
             encodings = layout.data_encodings(self._stored)
@@ -279,7 +278,6 @@ def is_text(value: str) -> bool:
 
 
 def _metadata_faults(key: str, value: Scalar) -> Iterator[str]:
-    """Yield why a value of the metadata cannot be stored."""
     if not isinstance(key, str) or not is_text(key) or not 0 < len(key) <= MOST_CHARACTERS:
         yield f"metadata {key!r:.80}: expected a text of valid characters as its name"
     elif isinstance(value, int) and not -(2**63) <= value < 2**63:
@@ -345,7 +343,6 @@ class StagedWriter:
         self._admission, self._exit = Admission(columns), ExitStack()
 
     def __enter__(self) -> "StagedWriter":
-        """Start or resume the recording."""
         if self._holds_work() and not self._resume and not self.root.exists():
             raise BadInputError(
                 f"{self.root}: an interrupted recording left {self._left()}; "

@@ -378,7 +378,6 @@ def _as_rows(name: str, values: Array, faults: list[str]) -> Array:
 
 
 def _transformed(values: Array, spec: ColumnMapping) -> Array:
-    """Apply `take`, `scale`, `offset` and `clip` to `values` (n, width)."""
     if spec.take:
         if max(spec.take) >= values.shape[1]:
             size = f"{', '.join(spec.fields)} hold {values.shape[1]} values, counted from 0"

@@ -221,7 +221,6 @@ def find_sources(
 
 
 def _found(recording: Path, suffixes: Sequence[str]) -> list[Source]:
-    """List the files of a recording that end with `suffixes`."""
     if not recording.exists():
         raise BadInputError(f"{recording} does not exist")
     if not (recording.is_file() or recording.is_dir()):

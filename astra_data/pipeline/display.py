@@ -95,7 +95,6 @@ class TimeEstimate:
         return max([(sum(of_running) + waiting) / max(1, len(self._running)), *of_running])
 
     def _means(self) -> dict[str, float]:
-        """Return how long an item takes, by its stage."""
         now, found = self._clock(), dict[str, list[float]]()
         running = [(key, (now - began) / share) for key, (began, share) in self._running.items() if share]
         for key, seconds in (*self._took, *running):

@@ -368,7 +368,6 @@ def _first_line(error: Exception) -> str:
 
 
 def _work(key: str, work: bytes, log: Path, here: tuple[Path, list[str]], mailbox: Any) -> Outcome:  # noqa: ANN401 - Ray's
-    """Run an item in a task of Ray's."""
     ray = sys.modules["ray"]
     folder, modules = here
     try:

@@ -85,7 +85,6 @@ class Experiment:
         return self.place(key).is_dir() and not self.maker(stage)._is_link(stage)
 
     def _is_link(self, stage: str) -> bool:
-        """Return whether a stage's folder is a link to another recipe's, from this run or an earlier one."""
         link = self.folder / stage
         return link.is_symlink() and link.readlink().parent.parent == Path("..")
 

@@ -296,7 +296,6 @@ def _drives(commands: Sequence[Field]) -> list[tuple[str, dict[str, str], tuple[
 
 
 def _is_turn_rate(command: Field) -> bool:
-    """Return whether a heading changes by it."""
     is_turned = command.unit == "rad/s" and HEADING.fullmatch(command.plain)
     return bool(is_turned or (command.unit in ("1", "rad/s") and TURN_RATE.fullmatch(command.plain)))
 

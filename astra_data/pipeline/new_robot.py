@@ -93,7 +93,6 @@ def _of_mapping(name: str, logs: Sequence[Path]) -> dict[str, str]:
 
 
 def _values(name: str, simulator: SimulatorKind) -> dict[str, str]:
-    """Return what the templates name."""
     logs = simulator.logs
     states, commands = logs.of("state"), logs.of("command")
     lines = ["| field | used as | unit | factor | why |", "|---|---|---|---|---|"]
@@ -216,7 +215,6 @@ def _arc(angles: Floats) -> tuple[float, float]:
 
 
 def _column(role: Role, logs: Logs) -> str:
-    """Return the table of a column in a mapping."""
     fields, lines = logs.of(role), [f'[columns."{_COLUMNS[role]}"]']
     if fields[0].why.endswith("(CHECK)"):
         called = f"{fields[0].name} is {fields[0].why.removesuffix(' (CHECK)')}"

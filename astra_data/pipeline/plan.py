@@ -171,7 +171,6 @@ class _Plan:
                         yield self._item(stage, seed, percent, name)
 
     def _has(self, stage: Stage) -> bool:
-        """Return whether the recipe has a stage that makes datasets."""
         if stage.each == "size":
             return bool(self.selection.percents)
         return stage.asked_by is None or getattr(self.recipe, stage.asked_by) is not None
@@ -260,7 +259,6 @@ class _Plan:
 
 
 def _command(recipe: Recipe, path: Path, selection: Selection) -> str:
-    """Return the command that makes `selection`."""
     axes = {
         "method": (selection.methods, recipe.methods),
         "seed": (selection.seeds, recipe.seeds),

@@ -37,7 +37,6 @@ _FILLED: Any = Field(default_factory=dict, validate_default=True)
 
 
 def _stage_field(stage: Stage) -> tuple[Any, Any]:
-    """Return the type and the default of a stage's table."""
     if stage.name == "collect":
         return stage.config | None, _FILLED
     if stage.name == "align":

@@ -354,7 +354,6 @@ def _needed(key: str, items: Mapping[str, Item]) -> Iterator[str]:
 
 
 def _tracked(project: str, recipe: str) -> Callable[[dict[str, Any]], None]:
-    """Return a function that logs each point as a run of a trackio project."""
     trackio = optional("trackio")
 
     def log(line: dict[str, Any]) -> None:

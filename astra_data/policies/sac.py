@@ -112,7 +112,6 @@ class Sac(Learner):
 
     @torch.no_grad()
     def _act(self) -> None:
-        """Take one step and add it to the buffer."""
         names = ("observation", "previous_action", "hidden", "first")
         seen = {name: getattr(self, name) for name in names}
         features, hidden = self.policy.remember(self.observation, self.previous_action, self.hidden)
@@ -122,7 +121,6 @@ class Sac(Learner):
         self._replay.add(**seen, action=action, reward=reward, terminated=step.terminated, expired=expired)
 
     def _learn(self) -> None:
-        """Update actor, critics and temperature once."""
         config = self.config
         steps, learned = self._replay.windows(config.batch_size // self._window, self._window, self._burn_in)
         if not bool(learned.any()):

@@ -303,7 +303,6 @@ def _cost(results: Results, stage: str, row: str, clock: str) -> float | None:
 
 
 def _speeds(results: Results) -> dict[str, str]:
-    """Return the speeds of each stage, as text."""
     table = results.table
     found = table[table["measure"].str.endswith("_per_second")]
     texts: dict[str, list[str]] = {}
@@ -360,7 +359,6 @@ def _provenance(results: Results) -> Iterator[Block]:
 
 
 def _described(origin: Origin) -> tuple[str, str, str]:
-    """Return code, machine and versions in words."""
     commit, on = (origin.commit or "").removesuffix("-dirty"), origin.machine
     changed = " with uncommitted changes" if commit != origin.commit else ""
     code = f"commit `{commit}`{changed}" if commit else "not recorded"

@@ -263,7 +263,6 @@ class EpisodeChecks:
             report.fault("values", described.alteration(altered, run.path, run.row, len(run), number))
 
     def _check_row(self, number: int, run: plain.Run, row: Mapping[str, Any]) -> None:
-        """Compare an episode with its row of meta/episodes."""
         start = self.report.frames
         place = {key: row.get(f"data/{key}") for key in ("chunk_index", "file_index")}
         known = all(isinstance(index, int) for index in place.values())

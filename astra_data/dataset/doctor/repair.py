@@ -202,7 +202,6 @@ def join(
 
 
 def _digest(values: Mapping[str, Array], columns: Sequence[Column]) -> bytes:
-    """Return the sha256 of an episode's values."""
     digest = hashlib.sha256()
     for column in columns:
         digest.update(values[column.name].astype(column.dtype).tobytes())
@@ -287,7 +286,6 @@ def _metadata(folder: Path, notes: list[str]) -> dict[int, dict[str, Scalar]]:
 
 
 def _description(folder: Path, remains: Remains, sources: Sequence[Dataset]) -> dict[str, Any]:
-    """Return that of the new dataset."""
     config, old = {"folder": folder.name}, sources[0].description if sources else remains.old
     if not old:
         return {

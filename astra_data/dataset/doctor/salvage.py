@@ -105,7 +105,6 @@ def _lost(first: int, last: int) -> str:
 
 
 def _name(path: Path) -> str:
-    """Return the path of a data file inside its dataset."""
     return "/".join(path.parts[-3:])
 
 
@@ -348,7 +347,6 @@ def _decoded(data: bytes | memoryview, position: int) -> tuple[Struct, int]:
 
 
 def _encoded(kind: int, value: Any) -> bytes:  # noqa: ANN401 - any thrift value
-    """Return the bytes of a value as `_decoded` returns it."""
     if kind in (TRUE, FALSE, BYTE):
         return bytes([value])
     if kind in (I16, I32, I64):

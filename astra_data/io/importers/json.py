@@ -68,7 +68,6 @@ def _read_lines(source: Source, names: Sequence[str]) -> Iterator[Block]:
 
 
 def _picked(row: dict[str, Any], names: Sequence[str], origin: str) -> list[Any]:
-    """Return the values of the fields `names` in a row."""
     flat = _flat(row)
     if not all(name in flat for name in names):
         row_count(origin, names, dict.fromkeys(flat, (1,)))

@@ -410,7 +410,6 @@ def _streams(file: McapFile, fields: Sequence[MessageField], of: dict[str, str],
 def _messages(
     source: Source, timeline: Timeline, fields: Mapping[str, list[MessageField]]
 ) -> Iterator[tuple[str, int, Message, bool]]:
-    """Yield messages as a `Resampler` takes them."""
     sizes: dict[str, tuple[int, ...]] = {}
     for topic, time, log_time, content, is_back in timeline.messages():
         values, faults = dict[str, Array](), list[str]()
@@ -475,7 +474,6 @@ def _is_list(value: Any) -> bool:
 
 
 def _names_in(owner: Any) -> list[str] | None:
-    """Return the list of names in a message; None if it has none."""
     names = _part(owner, _NAMES)
     if not _is_list(names) or not all(isinstance(name, str) for name in names):
         return None

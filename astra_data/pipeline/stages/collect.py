@@ -410,7 +410,6 @@ def collect(
 
 
 def _description(world: Task, config: CollectConfig, seed: int, name: str | None) -> dict[str, Any]:
-    """Return what the dataset says of itself."""
     files = _saved_files(config).items()
     saved = {f"{kind}_sha256": file_digest(path) for kind, path in files if path.is_file()}
     behaviors = config.behavior + ("-and-random" if config.random_share else "")

@@ -124,7 +124,6 @@ def is_current(recipe: Reported, *, root: Path, command: str, config: ReportConf
 
 
 def _digests(recipe: Reported, root: Path, command: str, config: ReportConfig) -> dict[str, str]:
-    """Return the digest of each evaluation that is finished, of a choice, and of settings and version."""
     points = product(recipe.methods, recipe.percents or (None,), recipe.seeds)
     keys = [artifact_key("evaluate", row, seed, percent) for row, percent, seed in points]
     read = {key: root / key / EVALUATION for key in keys} | {FOLDER: root / FOLDER / SELECTED}

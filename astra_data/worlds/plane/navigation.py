@@ -59,7 +59,6 @@ class Navigation(PlanarObjective):
     start_offsets_m: tuple[tuple[float, float], ...] = ((0.0, 0.0),)  # from the center of the start cell
 
     def __post_init__(self) -> None:
-        """Check that starts and goals are in free space."""
         farthest = 3 * self.spread_m + self.path_clearance_m
         if farthest >= self.maze.scale / 2:
             raise BadInputError(
