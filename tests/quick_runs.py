@@ -52,5 +52,5 @@ def run_here(path: Path, until: str | None = None, device: str = "cpu") -> Path:
 
 def fit_quickly(patch: pytest.MonkeyPatch) -> None:
     """Fit failure and scatter models in a few updates: they foresee nothing."""
-    for model in ("failures", "scatter"):
+    for model in ("failures", "history"):
         patch.setattr(f"astra_data.grounding.{model}._DESCENT", DescentConfig(updates=3, learning_rate=1e-3))

@@ -115,8 +115,10 @@ def permutation(uids: Iterable[int], seed: int) -> list[int]:
 def read_description(root: Path) -> dict[str, Any]:
     """Return meta/astra/dataset.json: the result of `complete_description`, the content hash, and more."""
     found = read_object(root / DATASET_PATH)
-    if isinstance(found, str) or not is_sealed(found):
-        raise CorruptDatasetError(f"{DATASET_PATH} {found if isinstance(found, str) else 'was altered'}")
+    if isinstance(found, str):
+        raise CorruptDatasetError(f"{DATASET_PATH} {found}")
+    if not isinstance(sums := found.get("sums"), dict) or sums.get(DATASET_PATH) != _sum_of(found):
+        raise CorruptDatasetError(f"{DATASET_PATH} was altered")
     if faults := _faults({key: found.get(key) for key in _DEFAULTS}):
         raise CorruptDatasetError(f"{DATASET_PATH}: {'; '.join(faults)}")
     return found
@@ -176,12 +178,6 @@ def sealed(root: Path, description: Mapping[str, Any]) -> dict[str, Any]:
     full: dict[str, Any] = json.loads(json.dumps({**description, "sums": sums}))
     full["sums"][DATASET_PATH] = _sum_of(full)
     return full
-
-
-def is_sealed(description: Mapping[str, Any]) -> bool:
-    """Return whether `description` is as it was sealed."""
-    sums = description.get("sums")
-    return isinstance(sums, dict) and sums.get(DATASET_PATH) == _sum_of(description)
 
 
 def altered_files(root: Path, description: Mapping[str, Any]) -> list[str]:

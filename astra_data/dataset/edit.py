@@ -69,7 +69,7 @@ def subset(
         )
     chosen = source.subset_seed if seed is None else seed
     config: dict[str, Any] = {"episodes": count, "percent": percent, "of": of, "seed": chosen}
-    order = permutation(_uids(source), chosen)
+    order = permutation(source.uids.tolist(), chosen)
     if stratify:
         order, strata = _stratified(source, stratify, chosen)
         config |= {"stratify": stratify, "strata": strata}
@@ -83,7 +83,7 @@ def share(percent: int, episodes: int) -> int:
 
 def check_uids(dataset: Dataset, uids: Sequence[int]) -> None:
     """Raise a BadInputError unless `dataset` has the episodes `uids`."""
-    known = sorted(_uids(dataset))
+    known = sorted(dataset.uids.tolist())
     if unknown := sorted(set(uids) - set(known)):
         its = f"its {len(dataset)} uids lie between {known[0]} and {known[-1]}: {first_few(known, MOST_UIDS)}"
         raise BadInputError(f"{dataset.reference} has no episode {first_few(unknown, MOST_UIDS)}; {its}")
@@ -95,7 +95,7 @@ def delete(source: Dataset, uids: Sequence[int], *, name: str | None = None, out
     if not uids:
         raise BadInputError("expected the uids of episodes to leave out, got none")
     config = {"episodes": sorted(set(uids))}
-    return _write(source, set(_uids(source)) - set(uids), stage="delete", config=config, name=name, out=out)
+    return _write(source, set(source.uids.tolist()) - set(uids), stage="delete", config=config, name=name, out=out)
 
 
 def filter_episodes(
@@ -114,7 +114,7 @@ def filter_episodes(
     config = only_given(**given, min_length=min_length, max_length=max_length)
     if not config:
         raise BadInputError("a filter needs a condition: on success, return or length")
-    kept, uids = set(_uids(source)), _uids(source)
+    kept, uids = set(source.uids.tolist()), source.uids.tolist()
     bounds = {"success": (success, success), "return": (min_return, max_return), "length": (min_length, max_length)}
     for key, (low, high) in bounds.items():
         if (low, high) != (None, None):
@@ -174,7 +174,7 @@ def _write(source: Dataset, kept: set[int], *, seed: int | None = None, **descri
     if not kept:
         raise BadInputError(f"{source.reference}: none of its {len(source)} episodes would be left")
     with next_version(source, "episodes", subset_seed=seed, **described) as writer:
-        chosen = [index for index, uid in enumerate(_uids(source)) if uid in kept]
+        chosen = [index for index, uid in enumerate(source.uids.tolist()) if uid in kept]
         for episode in source.episodes(episodes=chosen):
             writer.add(episode)
     return writer.root
@@ -184,10 +184,6 @@ def _tasks(source: Dataset) -> list[str]:
     """Return the tasks of its episodes, which have their own where there are several."""
     tasks = [source.task if task is None else str(task) for task in source.metadata.get("task", [])]
     return list(dict.fromkeys(tasks)) or [source.task]
-
-
-def _uids(source: Dataset) -> list[int]:
-    return [int(uid) for uid in source.uids]
 
 
 def _facts(source: Dataset, key: str) -> Sequence[Scalar | None]:
@@ -206,7 +202,7 @@ def _facts(source: Dataset, key: str) -> Sequence[Scalar | None]:
 def _stratified(source: Dataset, key: str, seed: int) -> tuple[list[int], dict[str, int]]:
     """Order the uids so that every prefix has its share of each stratum; return the episodes per stratum, too."""
     # A subset stratified likewise hands on its own counts, not its rounded shares.
-    stratum = dict(zip(_uids(source), map(str, _facts(source, key)), strict=True))
+    stratum = dict(zip(source.uids.tolist(), map(str, _facts(source, key)), strict=True))
     strata, config = dict(sorted(Counter(stratum.values()).items())), source.description["config"]
     if (config.get("stratify"), config.get("seed")) == (key, seed):
         strata = dict(config["strata"])
@@ -219,11 +215,11 @@ def _stratified(source: Dataset, key: str, seed: int) -> tuple[list[int], dict[s
 
 def _merged_uids(sources: Sequence[Dataset], new_uids: bool) -> list[dict[int, int]]:
     """Return, for each of `sources`, its episodes' new uids by their old ones."""
-    known, taken = {uid for source in sources for uid in _uids(source)}, set[int]()
+    known, taken = {uid for source in sources for uid in source.uids.tolist()}, set[int]()
     names: list[dict[int, int]] = []
     for source in sources:
         origin, named = f"{source.content_hash} ".encode(), dict[int, int]()
-        for uid in _uids(source):
+        for uid in source.uids.tolist():
             named[uid] = new_uid(uid, origin, known) if uid in taken else uid
             known.add(named[uid])
             taken.add(named[uid])

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -81,7 +80,10 @@ class Inspection:
 def inspect_dataset(dataset: Dataset) -> Inspection:
     """Summarize `dataset`, reading it once, one episode at a time."""
     ranges, successes = dataset.statistics(), dataset.successes()
-    spreads = [_empty_spread(column, ranges[column.name]) for column in dataset.schema]
+    spreads = []
+    for column in dataset.schema:
+        low, high, mean = (np.array(ranges[column.name][key], np.float64) for key in ("min", "max", "mean"))
+        spreads.append(Spread(column, low, high, mean, np.zeros((column.size, BINS), np.int64)))
     positions, velocities = (_empty_map(dataset, role) for role in ("position", "vector"))
     endings = Endings() if TERMINATED in dataset.features else None
     for episode in dataset.episodes():
@@ -111,11 +113,6 @@ def visited(dataset: Dataset, role: str = "position") -> Map | None:
         for block in dataset.blocks([STATE]):
             _visit(planar, block[STATE][:, group])
     return found and found[0]
-
-
-def _empty_spread(column: Column, ranges: Mapping[str, Any]) -> Spread:
-    low, high, mean = (np.array(ranges[key], np.float64) for key in ("min", "max", "mean"))
-    return Spread(column, low, high, mean, np.zeros((column.size, BINS), np.int64))
 
 
 def _count(spread: Spread, values: Array) -> None:

@@ -18,10 +18,9 @@ from astra_data.dataset.columns import REWARD
 from astra_data.grounding.descent import Descent, DescentConfig, WindowedConfig
 from astra_data.grounding.encoder import Encoder, HistoryEncoder, take_scales
 from astra_data.grounding.failures import failure_figures, fit_failures, has_failures
-from astra_data.grounding.history import HistoryGrounding
+from astra_data.grounding.history import HistoryGrounding, fit_scatter
 from astra_data.grounding.model import GroundingModel, GroundingShape, LossWeights, recorded_rewards, telemetry
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.grounding.scatter import fit_scatter
 from astra_data.grounding.simulator import FittedGrounding
 from astra_data.worlds.task import Task
 

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from astra_data.core.durable import disk_error
-from astra_data.core.errors import AstraDataError, BadInputError, optional
+from astra_data.core.errors import AstraDataError, BadInputError, in_short, optional
 from astra_data.core.naming import stage_of_key
 from astra_data.core.progress import Progress
 from astra_data.core.provenance import cores
@@ -312,7 +312,7 @@ def execute_on_cluster(
         ray.init(address, log_to_driver=False, logging_level="ERROR", **local)
     except (ConnectionError, RuntimeError, ValueError) as error:
         advice = "`ray status` lists clusters, `ray start --head` starts one"
-        raise BadInputError(f"found no usable Ray cluster at {address}: {_first_line(error)}; {advice}") from None
+        raise BadInputError(f"found no usable Ray cluster at {address}: {in_short(error)}; {advice}") from None
     running: dict[Any, str] = {}
     here = Path.cwd(), sys.path
 
@@ -330,7 +330,7 @@ def execute_on_cluster(
             try:
                 yield key, ray.get(begun)
             except ray.exceptions.RayError as error:
-                yield key, AstraDataError(f"{key} was lost with its worker: {_first_line(error)}")
+                yield key, AstraDataError(f"{key} was lost with its worker: {in_short(error)}")
 
     try:
         if any(item.wants_gpu for item in items) and not ray.cluster_resources().get("GPU"):
@@ -339,7 +339,7 @@ def execute_on_cluster(
         task = ray.remote(num_cpus=1, max_retries=0)(_work)
         run_in_order(items, jobs, watch, begin, events)
     except (ray.exceptions.RayError, ConnectionError) as error:
-        raise AstraDataError(f"the Ray cluster at {address} was lost: {_first_line(error)}") from None
+        raise AstraDataError(f"the Ray cluster at {address} was lost: {in_short(error)}") from None
     finally:
         with suppress(ray.exceptions.RayError, ConnectionError):
             for begun in running:
@@ -361,10 +361,6 @@ class _Mailbox:
     def take(self) -> list[tuple[str, Note | None]]:
         notes, self._notes = self._notes, []
         return notes
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).strip().partition("\n")[0]
 
 
 def _work(key: str, work: bytes, log: Path, here: tuple[Path, list[str]], mailbox: Any) -> Outcome:  # noqa: ANN401 - Ray's

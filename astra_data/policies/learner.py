@@ -5,7 +5,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from statistics import fmean
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,15 +15,6 @@ from astra_data.worlds.protocols import BatchedEnv, Step
 
 _ROUNDING = 1e-9  # of a sum of shares
 _ROWS = ("previous_action", "hidden", "first", "age", "lasted")  # what checkpoints hold of the rows
-
-
-class Taken(NamedTuple):
-    """The outcome of one step of all rows."""
-
-    step: Step
-    action: Tensor  # (B, A) in ±1, as applied
-    expired: Tensor  # (B,) bool, the episode reached the horizon
-    done: Tensor  # (B,) bool, it ended, expired or terminated
 
 
 class Learner(ABC):
@@ -60,8 +51,11 @@ class Learner(ABC):
     def _forget(self) -> None:
         self._taken = self._finished = self._succeeded = self._survived = self._rewarded = 0.0
 
-    def take(self, action: Tensor, hidden: Tensor) -> Taken:
-        """Apply `action` (B, A), clipped to ±1, keep `hidden` (B, H), and reset the rows that are done."""
+    def take(self, action: Tensor, hidden: Tensor) -> tuple[Step, Tensor, Tensor, Tensor]:
+        """Apply `action` (B, A), keep `hidden` (B, H), and reset the rows that are done.
+
+        Return the step, the action clipped to ±1, and which rows (B,) reached the horizon, and which ended.
+        """
         began = time.perf_counter()
         step = self.env.step(action)
         self.world_seconds += time.perf_counter() - began
@@ -77,7 +71,7 @@ class Learner(ABC):
         self.observation = self.env.reset(done) if bool(done.any()) else step.observation
         executed, going = action.clamp(-1.0, 1.0), (~done).float().unsqueeze(-1)
         self.previous_action, self.hidden, self.first = executed * going, hidden * going, done
-        return Taken(step, executed, expired, done)
+        return step, executed, expired, done
 
     def figures(self) -> dict[str, float]:
         """Return means on the steps since the last call: success and steps of the episodes that ended, the reward."""

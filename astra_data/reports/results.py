@@ -136,15 +136,6 @@ class Results(Facts):
         )
 
     @cached_property
-    def error_table(self) -> "pd.DataFrame":
-        """Return a line for each error: row, seed, percent, simulator, quantity, horizon, mean, low, high."""
-        import pandas as pd
-
-        columns = ["row", "seed", "percent", "simulator", "quantity", "horizon", "mean", "low", "high"]
-        lines = [(*e.key, *v) for e in self.errors for v in zip(e.horizons, e.mean, e.low, e.high, strict=True)]
-        return pd.DataFrame(lines, columns=columns)
-
-    @cached_property
     def percents(self) -> list[int]:
         """The sizes of the dataset with a tested method or, without any, with a grounding, ascending."""
         tested = {line.percent for line in self.lines if line.where == TESTED}
@@ -208,9 +199,12 @@ class Results(Facts):
 
     def mean_errors(self, percent: int | None = None) -> "pd.DataFrame":
         """Return mean, low, high by row, simulator, quantity, horizon, averaged over seeds, of shared horizons."""
+        import pandas as pd
+
         index, values = ["row", "simulator", "quantity", "horizon"], ["mean", "low", "high"]
-        found = self.error_table
-        found = found[found["percent"] == (percent or self.largest)]
+        errors = [one for one in self.errors if one.percent == (percent or self.largest)]
+        lines = [(*e.key, *v) for e in errors for v in zip(e.horizons, e.mean, e.low, e.high, strict=True)]
+        found = pd.DataFrame(lines, columns=["row", "seed", "percent", *index[1:], *values])
         if found.empty:
             return found.set_index(index)[values]
         per_fit = found[found["simulator"] == "grounded"].groupby(["row", "seed", "quantity"])["horizon"]

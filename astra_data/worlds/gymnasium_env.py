@@ -10,8 +10,8 @@ import numpy as np
 from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError
 from astra_data.worlds.commands import Commands
-from astra_data.worlds.robot import State
 from astra_data.worlds.simulators import NumpySimulator
+from astra_data.worlds.task import State
 from astra_data.worlds.user_code import answered, explained
 
 Env = gymnasium.Env[Any, Any]

@@ -110,8 +110,9 @@ class MujocoModel(FreeStates):
         return self.state
 
 
-_PHYSICS = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
-_STATE = int(_PHYSICS | mujoco.mjtState.mjSTATE_WARMSTART | mujoco.mjtState.mjSTATE_CTRL)
+PHYSICS_STATE = int(
+    mujoco.mjtState.mjSTATE_FULLPHYSICS | mujoco.mjtState.mjSTATE_WARMSTART | mujoco.mjtState.mjSTATE_CTRL
+)
 
 
 def add_walls(world: ElementTree.Element, maze: Maze, height: float, **attributes: str) -> None:
@@ -165,7 +166,7 @@ class BatchedPhysics:
         self.num_threads = min(num_threads or cores(), num_envs)
         self._watched = frozenset(range(watched_geoms[0], watched_geoms[1] + 1) if watched_geoms else ())
         self._measure = measure
-        self.state: Floats = np.zeros((num_envs, mujoco.mj_stateSize(model, _STATE)))  # warm start included
+        self.state: Floats = np.zeros((num_envs, mujoco.mj_stateSize(model, PHYSICS_STATE)))  # warm start included
         self.qpos, self.qvel = views(model, self.state)
         self.touching: Bools = np.zeros(num_envs, dtype=bool)  # a watched geom, at the end of the last step
         self._control: Floats = self.state[:, self.state.shape[1] - model.nu :]
@@ -184,7 +185,7 @@ class BatchedPhysics:
             data.qpos[:] = position
             data.qvel[:] = velocity
             mujoco.mj_forward(self.model, data)
-            mujoco.mj_getState(self.model, data, self._rows[row], _STATE)
+            mujoco.mj_getState(self.model, data, self._rows[row], PHYSICS_STATE)
             if self._measure is not None:
                 self.measured[row] = self._measure(data)
         self.touching[rows] = False
@@ -201,9 +202,9 @@ class BatchedPhysics:
         get_state, set_state, step = mujoco.mj_getState, mujoco.mj_setState, mujoco.mj_step
         for row in rows:
             state = self._rows[row]
-            set_state(model, data, state, _STATE)
+            set_state(model, data, state, PHYSICS_STATE)
             step(model, data, substeps)
-            get_state(model, data, state, _STATE)
+            get_state(model, data, state, PHYSICS_STATE)
             if watched:
                 # Few geoms touch: a set is a third of the time of numpy's comparisons.
                 self.touching[row] = not watched.isdisjoint(data.contact.geom.flat)

@@ -10,8 +10,7 @@ from torch import Tensor
 from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import generator
 from astra_data.worlds.protocols import AbstractSimulator
-from astra_data.worlds.robot import RobotEnv
-from astra_data.worlds.task import Task
+from astra_data.worlds.task import RobotEnv, Task
 from astra_data.worlds.user_code import answered, expect, expect_tensor, explained, judged, paid, stepped
 
 _COUNT = 3

@@ -8,11 +8,10 @@ from toy_episodes import toy_episodes
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import generator
-from astra_data.grounding.history import HistoryGrounding
+from astra_data.grounding.history import HistoryGrounding, ScatterModel, ScatterShape
 from astra_data.grounding.model import GroundingModel, GroundingShape
 from astra_data.grounding.open_loop import _interval, _starts, distances, gap_report, replay_open_loop
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.grounding.scatter import ScatterModel, ScatterShape
 from astra_data.grounding.simulator import NO_GROUNDING, Grounding
 from astra_data.worlds.plane.point_mass import PointMass
 

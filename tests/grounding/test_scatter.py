@@ -10,10 +10,9 @@ from torch.distributions import Normal
 from toy_episodes import toy_episodes
 
 from astra_data.grounding.descent import DescentConfig
-from astra_data.grounding.history import HistoryGrounding
+from astra_data.grounding.history import HistoryGrounding, ScatterModel, ScatterShape, fit_scatter
 from astra_data.grounding.model import GroundingModel, GroundingShape
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.grounding.scatter import ScatterModel, ScatterShape, fit_scatter
 from astra_data.grounding.simulator import EpisodeSimulator
 from astra_data.robots.registry import TASKS
 
@@ -45,7 +44,7 @@ def brisk() -> Iterator[None]:
     """Fit in fewer updates, each of which goes farther."""
     with pytest.MonkeyPatch.context() as patch:
         settings = DescentConfig(updates=300, learning_rate=3e-3)
-        patch.setattr("astra_data.grounding.scatter._DESCENT", settings)
+        patch.setattr("astra_data.grounding.history._DESCENT", settings)
         yield
 
 
@@ -75,8 +74,8 @@ def test_the_scale_is_told_by_the_moment_and_the_forms_are_those_of_held_out_ste
 
 
 def test_forms_are_drawn_from_the_seed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("astra_data.grounding.scatter._DESCENT", DescentConfig(updates=1, learning_rate=1e-9))
-    monkeypatch.setattr("astra_data.grounding.scatter._MOST_FORMS", 100)
+    monkeypatch.setattr("astra_data.grounding.history._DESCENT", DescentConfig(updates=1, learning_rate=1e-9))
+    monkeypatch.setattr("astra_data.grounding.history._MOST_FORMS", 100)
     given = grounding_model(), scattered_episodes(0, 4), scattered_episodes(1, 4)
     (one, figures), (other, _) = (fit_scatter(*given, seed) for seed in (0, 1))
     assert len(one.forms) == 100 and (one.forms - other.forms).abs().max() > 0.1

@@ -9,9 +9,8 @@ from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env import VecMonitor
 
 import astra_data.envs
-from astra_data.grounding.history import HistoryGrounding
+from astra_data.grounding.history import HistoryGrounding, ScatterModel, ScatterShape
 from astra_data.grounding.model import GroundingModel, GroundingShape
-from astra_data.grounding.scatter import ScatterModel, ScatterShape
 from astra_data.grounding.simulator import NO_GROUNDING
 from astra_data.policies.gymnasium import Array, BatchedVectorEnv, SeededSimulatorEnv, SingleEnv
 from astra_data.policies.simulator_env import SimulatorEnv

@@ -109,9 +109,9 @@ def test_where_the_episodes_cannot_go_on_new_ones_begin() -> None:
 
 def take(rows: Noisy) -> tuple[torch.Tensor, torch.Tensor]:
     """Take a step too wide; return who expired and who is done."""
-    taken = rows.take(torch.full((rows.env.num_envs, 1), 1.5), torch.ones(rows.env.num_envs, 2))
-    assert torch.equal(taken.action, torch.ones(rows.env.num_envs, 1))
-    return taken.expired, taken.done
+    _, action, expired, done = rows.take(torch.full((rows.env.num_envs, 1), 1.5), torch.ones(rows.env.num_envs, 2))
+    assert torch.equal(action, torch.ones(rows.env.num_envs, 1))
+    return expired, done
 
 
 @pytest.mark.parametrize(("length", "horizon", "expires"), [(4.0, 9, False), (9.0, 4, True), (4.0, 4, False)])

@@ -13,7 +13,7 @@ from small_cart import TASK, Reach
 from astra_data.core.errors import BadInputError
 from astra_data.worlds.commands import Commands
 from astra_data.worlds.gymnasium_env import Env, GymnasiumRobot, GymnasiumSimulator, observed
-from astra_data.worlds.robot import RobotEnv, State
+from astra_data.worlds.task import RobotEnv, State
 
 
 def torque(command: NDArray[np.float64], state: State) -> NDArray[np.float64]:

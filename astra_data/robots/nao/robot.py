@@ -3,7 +3,6 @@
 import copy
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from importlib.resources import files
@@ -21,7 +20,7 @@ from astra_data.robots.nao import walk
 from astra_data.robots.nao.kicking import BALL_RADIUS_M
 from astra_data.worlds.geometry import rotation_matrix
 from astra_data.worlds.plane.mazes import Maze
-from astra_data.worlds.simulators import add_walls, share_out, views, wall_geoms
+from astra_data.worlds.simulators import PHYSICS_STATE, BatchedPhysics, add_walls, share_out, wall_geoms
 
 SUBSTEPS = 3  # physics steps per tick: 4 ms each
 WALL_HEIGHT_M = 0.5
@@ -42,12 +41,11 @@ TICKS = 16  # per control step
 FALLEN_COSINE = 0.7  # a robot has fallen when the cosine between its up axis and the vertical is below this (45°)
 MOTORS = len(walk.TO_MOTORS)
 
-_STATE = int(mujoco.mjtState.mjSTATE_FULLPHYSICS | mujoco.mjtState.mjSTATE_WARMSTART | mujoco.mjtState.mjSTATE_CTRL)
 # Ankles among the motors: pitch, roll; left, right.
 _ANKLES = ((4, 5), (10, 11))
 
 
-class BatchedBodies:
+class BatchedBodies(BatchedPhysics):
     """B bodies of one model; one that has fallen stays as it is until its reset."""
 
     def __init__(
@@ -59,13 +57,10 @@ class BatchedBodies:
         style: walk.WalkStyle,
         num_threads: int,
     ) -> None:
-        self.model = model
-        self.traits = traits
-        self.style = style
-        self._stiffness = float(model.actuator_gainprm[0, 0])
         count = len(traits.stiffness)
-        self.state: Floats = np.zeros((count, mujoco.mj_stateSize(model, _STATE)))
-        self.qpos, self.qvel = views(model, self.state)
+        super().__init__(model, count, substeps=SUBSTEPS, num_threads=num_threads)
+        self.traits, self.style = traits, style
+        self._stiffness = float(model.actuator_gainprm[0, 0])
         self.sent: Floats = np.zeros((count, longest_delay_ticks + TICKS, MOTORS))
         self.tilting: Floats = np.zeros((count, 2))
         self.held: Floats = np.zeros((count, MOTORS))
@@ -73,38 +68,30 @@ class BatchedBodies:
         self.gyro: Floats = np.zeros((count, 3))
         self.pressure: Floats = np.zeros((count, 8))
         self.fallen: Bools = np.zeros(count, dtype=bool)
-        self.touching: Bools = np.zeros(count, dtype=bool)
         self._walls = wall_geoms(model)
         self._robot_geoms = np.zeros(model.ngeom, dtype=bool)
         self._robot_geoms[[model.geom(name).id for name in ("chest", "LFoot", "RFoot")]] = True
-        self._models = [copy.copy(model) for _ in range(min(num_threads, count))]
-        self._data = [mujoco.MjData(one) for one in self._models]
-        self._pool = ThreadPoolExecutor(len(self._models))
+        self._models = [copy.copy(model) for _ in self._data]
 
     def reset(self, rows: NDArray[np.intp], qpos: Floats, angles: Floats) -> None:
         """Set the bodies `rows` (n,) at rest at `qpos` (n, nq), their servos holding `angles` (n, 12)."""
-        data = self._data[0]
-        for row, position in zip(rows, qpos, strict=True):
-            mujoco.mj_resetData(self.model, data)
-            data.qpos[:] = position
-            mujoco.mj_forward(self.model, data)
-            mujoco.mj_getState(self.model, data, self.state[row], _STATE)
+        self.set_state(rows, qpos, np.zeros((len(rows), self.model.nv)))
         self.sent[rows], self.held[rows] = angles[:, None], angles
-        for part in (self.waited, self.tilting, self.gyro, self.pressure, self.fallen, self.touching):
+        for part in (self.waited, self.tilting, self.gyro, self.pressure, self.fallen):
             part[rows] = 0
 
-    def step(self, rows: NDArray[np.intp], targets: walk.Targets, noise: Floats) -> NDArray[np.intp]:
+    def advance(self, rows: NDArray[np.intp], targets: walk.Targets, noise: Floats) -> NDArray[np.intp]:
         """Run `rows` (n,) through one control step; return how many ticks of the targets were followed, (B,) int."""
         self.touching[rows] = False
         rows = rows[~self.fallen[rows]]
         before = self.sent.shape[1] - TICKS
         self.sent[rows, :before] = self.sent[rows, TICKS:]
         followed = np.zeros(len(self.fallen), dtype=np.intp)
-        work = partial(self._step_rows, targets, noise, followed)
-        share_out(rows.tolist(), self._pool, work, len(self._models))
+        work = partial(self._walk_rows, targets, noise, followed)
+        share_out(rows.tolist(), self._pool, work, self.num_threads)
         return followed
 
-    def _step_rows(
+    def _walk_rows(
         self, targets: walk.Targets, noise: Floats, followed: NDArray[np.intp], thread: int, rows: Iterator[int]
     ) -> None:
         model, data, traits = self._models[thread], self._data[thread], self.traits
@@ -113,9 +100,9 @@ class BatchedBodies:
             model.geom_friction[floor, 0] = traits.friction[row]
             stiffness = self._stiffness * traits.stiffness[row]
             model.actuator_gainprm[:, 0], model.actuator_biasprm[:, 1] = stiffness, -stiffness
-            mujoco.mj_setState(model, data, self.state[row], _STATE)
+            mujoco.mj_setState(model, data, self.state[row], PHYSICS_STATE)
             followed[row] = self._walk(model, data, row, targets, noise[row])
-            mujoco.mj_getState(model, data, self.state[row], _STATE)
+            mujoco.mj_getState(model, data, self.state[row], PHYSICS_STATE)
             self.pressure[row] = data.sensordata
 
     def _walk(self, model: mujoco.MjModel, data: mujoco.MjData, row: int, targets: walk.Targets, noise: Floats) -> int:
@@ -229,7 +216,7 @@ class BatchedNao:
             0.0, self.spread.gyro_noise_rad_s, (self.num_robots, TICKS, 3)
         )
         self._steps += 1
-        self.gait = targets.reached(self.bodies.step(rows, targets, noise))
+        self.gait = targets.reached(self.bodies.advance(rows, targets, noise))
 
     def reseed(self, seed: int) -> None:
         """Restart the noise of the sensors at `seed`."""

@@ -98,7 +98,7 @@ def noise(count: int = 1) -> Floats:
 
 def test_angles_arrive_after_their_delay() -> None:
     robots = bodies(3, delay_ticks=np.array([0, 2, 3]))
-    followed = robots.step(np.arange(3), targets(3), noise(3))
+    followed = robots.advance(np.arange(3), targets(3), noise(3))
     assert followed.tolist() == [TICKS] * 3
     expected = (STANDING + 1e-3 * np.arange(1, TICKS + 1)[:, None])[:, legs.TO_MOTORS]
     for row in range(3):
@@ -109,14 +109,14 @@ def test_angles_arrive_after_their_delay() -> None:
     for row, delay in enumerate((0, 2, 3)):
         np.testing.assert_allclose(controls[row], expected[TICKS - 1 - delay])
     # The last ticks of this control step are the first of the next.
-    robots.step(np.arange(3), targets(3), noise(3))
+    robots.advance(np.arange(3), targets(3), noise(3))
     np.testing.assert_allclose(robots.sent[:, :FIRST], np.tile(expected[-FIRST:], (3, 1, 1)))
 
 
 def test_one_control_step_is_mujocos_own_with_each_robots_floor_and_servos() -> None:
     robots = bodies(2, friction=np.array([0.3, 0.7]), stiffness=np.array([0.8, 1.0]), height_m=0.02)
     before = robots.qpos.copy()
-    robots.step(np.arange(2), targets(2), noise(2))
+    robots.advance(np.arange(2), targets(2), noise(2))
     for row, (friction, stiffness) in enumerate(((0.3, 0.8), (0.7, 1.0))):
         model = nao_model()
         model.geom("floor").friction[0] = friction
@@ -139,7 +139,7 @@ def test_the_ankles_that_carry_push_against_the_measured_rates() -> None:
     robots = bodies(height_m=1.0, style=style, delay_ticks=np.array([0]))
     measured = noise()
     measured[0, 0] = [0.4, 0.8, 0.0]  # roll and pitch rate in the first tick only
-    robots.step(np.array([0]), targets(carries=(True, False)), measured)
+    robots.advance(np.array([0]), targets(carries=(True, False)), measured)
     planned = (STANDING + 1e-3 * np.arange(1, TICKS + 1)[:, None])[:, legs.TO_MOTORS]
     added = robots.sent[0, FIRST:] - planned
     assert added[0, [4, 5]] == pytest.approx([0.1 * 0.4, 0.2 * 0.2], abs=2e-3)
@@ -157,7 +157,7 @@ def test_a_foot_that_the_torso_leans_over_waits_to_be_lifted(lifts_off: int, lea
     robots.qpos[0, 3:5] = np.cos(half), np.sin(half)  # positive rolls are to the right
     planned = targets()
     planned.lifts_off[:, 0] = lifts_off
-    followed = robots.step(np.array([0]), planned, noise())
+    followed = robots.advance(np.array([0]), planned, noise())
     assert (followed[0] < TICKS) == waits
 
 
@@ -168,7 +168,7 @@ def test_a_robot_that_leans_by_over_45_degrees_any_way_has_fallen(axis: int, deg
     robots, half = bodies(height_m=1.0), np.radians(degrees) / 2
     robots.qpos[0, 3] = np.cos(half)
     robots.qpos[0, 4 + axis] = np.sin(half)
-    robots.step(np.array([0]), targets(), noise())
+    robots.advance(np.array([0]), targets(), noise())
     assert bool(robots.fallen[0]) == fallen
 
 
