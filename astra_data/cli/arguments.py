@@ -204,8 +204,7 @@ def run_stage(recipe: Path, stage: str, **options: Any) -> Path:
 
 def refuse(options: Mapping[str, object], stage: str, table: str | None = None) -> None:
     """Refuse `options` that are given, since a recipe sets them itself."""
-    given = [f"--{name.replace('_', '-')}" for name, value in options.items() if value is not None]
-    if given:
+    if given := [f"--{name.replace('_', '-')}" for name, value in options.items() if value is not None]:
         raise BadInputError(f"{stage}: the recipe's [{table or stage}] sets this: leave out {', '.join(given)}")
 
 

@@ -409,8 +409,7 @@ def new(
     show_table(table)
     typer.echo(f"abstract simulator: {simulator.described}")
     simulated, still = simulator.errors()
-    worse = [one for one, is_worse in zip(simulator.names, simulated > CLEARLY * still, strict=True) if is_worse]
-    if worse:
+    if worse := [one for one, is_worse in zip(simulator.names, simulated > CLEARLY * still, strict=True) if is_worse]:
         typer.echo(
             f"after {JUDGED_STEPS} steps it predicts {' and '.join(worse)} of the logs worse than standing "
             f"still would: edit `step` in {folder}/{name}.py"

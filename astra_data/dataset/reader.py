@@ -407,8 +407,7 @@ def format_fault(root: Path) -> str | None:
 
 def refuse_versions(root: Path) -> None:
     """Raise BadInputError where `root` holds versions of a dataset; name them."""
-    versions = sorted(path.name for path in root.glob("data-*.*.*") if (path / layout.INFO_PATH).is_file())
-    if versions:
+    if versions := sorted(path.name for path in root.glob("data-*.*.*") if (path / layout.INFO_PATH).is_file()):
         raise BadInputError(f"{root} contains versions of a dataset: name one of {', '.join(versions)}.")
 
 

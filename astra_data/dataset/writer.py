@@ -215,8 +215,7 @@ class DatasetWriter:
         self._write_json(layout.DATASET_PATH, described.sealed(self._folder, description))
         if self.policy:
             shutil.copyfile(self.policy, self._folder / layout.POLICY_PATH)
-        faults = Dataset.open(self._folder).verify()
-        if faults:
+        if faults := Dataset.open(self._folder).verify():
             raise CorruptDatasetError(f"{self.root} was not written: {'; '.join(faults)}. Check the disk.")
 
     def _video(self, name: str, number: int) -> Path:

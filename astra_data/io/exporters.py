@@ -32,8 +32,7 @@ def export(dataset: Dataset, out: Path, *, format: str) -> None:
     """Write `dataset` to a new `out`, in the layout of the library `format`; rewards are 0 where it has none."""
     if format not in EXPORTERS:
         raise BadInputError(f"format '{format}': unknown{did_you_mean(format, EXPORTERS)}")
-    missing = [name for name in NEEDED if name not in dataset.features]
-    if missing:
+    if missing := [name for name in NEEDED if name not in dataset.features]:
         raise BadInputError(f"{dataset.reference} cannot be exported: it lacks {', '.join(missing)}")
     if REWARD not in dataset.features:
         _log.warning("%s has no %s: rewards are written as 0", dataset.reference, REWARD)

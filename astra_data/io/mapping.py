@@ -64,8 +64,7 @@ class ColumnMapping(Config):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        unknown = sorted(set(self.role) - set(ROLES))
-        if unknown:
+        if unknown := sorted(set(self.role) - set(ROLES)):
             raise ValueError(f"unknown role {', '.join(unknown)}, expected {', '.join(ROLES)}")
         if doubled := sorted({name for name in self.names if self.names.count(name) > 1}):
             raise ValueError(f"names has {', '.join(doubled)} more than once")

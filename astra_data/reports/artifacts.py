@@ -196,8 +196,7 @@ def read_tensors(path: Path, names: tuple[str, ...]) -> dict[str, Floats]:
     from astra_data.core.checkpoint import load_tensors  # noqa: PLC0415 - figures of datasets do without torch
 
     tensors, _ = load_tensors(path)
-    missing = [name for name in names if name not in tensors]
-    if missing:
+    if missing := [name for name in names if name not in tensors]:
         raise BadInputError(f"{path}: expected tensors {missing}, got {sorted(tensors)}; run its stage again")
     return {name: tensor.double().numpy() for name, tensor in tensors.items()}
 

@@ -92,8 +92,7 @@ def pairing_named(name: str) -> Pairing:
             columns=(made.state, made.action),
         )
     needed = ("abstract_state", "abstraction", "parameters", "reset_to", "step")
-    missing = [attribute for attribute in needed if not hasattr(made, attribute)]
-    if missing:
+    if missing := [attribute for attribute in needed if not hasattr(made, attribute)]:
         raise BadInputError(
             f"{name} has no {', '.join(missing)}: expected what a Simulator has, see astra_data.worlds.protocols"
         )
@@ -116,8 +115,7 @@ def built(pairing: Pairing, count: int) -> AbstractSimulator:
     expected = (count, pairing.abstract_state.size)
     if shape != expected:
         raise BadInputError(f"{pairing.id}({count}).state has shape {shape}, expected {expected}")
-    faults = [key for key, value in parameters.items() if not isinstance(value, int | float | str)]
-    if faults:
+    if faults := [key for key, value in parameters.items() if not isinstance(value, int | float | str)]:
         raise BadInputError(f"{pairing.id}.parameters: expected numbers or texts for {', '.join(faults)}")
     return batch
 

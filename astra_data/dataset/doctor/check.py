@@ -128,8 +128,7 @@ def _info_faults(info: Mapping[str, Any], report: Report) -> list[plain.PlainCol
     if not isinstance(features, dict) or not all(list(checks.values())[1:]):
         return []
     columns, others = plain.plain_columns(features)
-    others = [name for name in others if features[name].get("dtype") not in ("video", "image")]
-    if others:
+    if others := [name for name in others if features[name].get("dtype") not in ("video", "image")]:
         report.note("features", f"not checked, because they are not numeric: {', '.join(others)}")
     for column in columns:
         labels = features[column.name].get("names")

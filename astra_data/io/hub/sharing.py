@@ -125,10 +125,9 @@ def pull(
         raise BadInputError(f"{source} is a folder here: pull ./{source}, or hf://datasets/{source} of the Hub")
     known = place.versions()
     if not known:
-        if isinstance(place, stores.UrlStore):
-            inside = [f"{place}/{name}" for name in place.names()[:MOST_NAMED] if place.below(name).versions()]
-            if inside:
-                raise BadInputError(f"{place} is a folder of datasets: pull one of {', '.join(inside)}")
+        names = place.names()[:MOST_NAMED] if isinstance(place, stores.UrlStore) else []
+        if inside := [f"{place}/{one}" for one in names if stores.UrlStore(f"{place}/{one}").versions()]:
+            raise BadInputError(f"{place} is a folder of datasets: pull one of {', '.join(inside)}")
         raise SharingError(
             f"{place} has no dataset of astra-data: no tag or folder such as data-1.2.0. "
             "A plain LeRobot dataset is opened with lerobot; otherwise check the spelling."

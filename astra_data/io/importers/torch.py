@@ -35,8 +35,7 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
 def layout(source: Source) -> dict[str, Any]:
     """Return the keys of a mapping for a joint log of PACE; fps is measured from its times."""
     tensors = _tensors(source)
-    missing = [field for field in (TIME, *PACE.values()) if field not in tensors]
-    if missing:
+    if missing := [field for field in (TIME, *PACE.values()) if field not in tensors]:
         named = f"a joint log of PACE (time, dof_pos, des_dof_pos): no {', '.join(missing)}"
         raise BadInputError(f"{source}: not {named}; pass --mapping")
     times = tensors[TIME].double().numpy().ravel()

@@ -197,8 +197,7 @@ def _check(source: Dataset, pairing: Pairing) -> None:
     if faults:
         raise BadInputError(f"{source.root} has {' and '.join(faults)}; expected a dataset to be paired")
     expected = pairing.origin.get("task", "")
-    faults = [fault for column in pairing.columns for fault in column_faults(source, column, expected)]
-    if faults:
+    if faults := [fault for column in pairing.columns for fault in column_faults(source, column, expected)]:
         raise BadInputError(f"{source.reference} {'; '.join(faults)}")
     if warning := names_apart(source, pairing.columns, expected):
         _log.warning(warning)
