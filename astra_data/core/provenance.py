@@ -62,7 +62,10 @@ def machine(device: str = "cpu") -> dict[str, Any]:
         import torch  # slow; only needed on GPUs
 
         gpu = torch.cuda.get_device_name(device)
-    return {"cpu": _cpu_name(), "cores": cores(), "memory_gib": round(memory_bytes() / 2**30, 1), "gpu": gpu}
+    cpuinfo = Path("/proc/cpuinfo")
+    found = re.search(r"^model name\s*: (.*)", cpuinfo.read_text(), re.MULTILINE) if cpuinfo.exists() else None
+    cpu = found[1].strip() if found else platform.processor() or platform.machine()
+    return {"cpu": cpu, "cores": cores(), "memory_gib": round(memory_bytes() / 2**30, 1), "gpu": gpu}
 
 
 def memory_bytes() -> int:
@@ -70,12 +73,6 @@ def memory_bytes() -> int:
     machine = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     limit = MEMORY_LIMIT.read_text().strip() if MEMORY_LIMIT.exists() else "max"
     return machine if limit == "max" else min(machine, int(limit))
-
-
-def _cpu_name() -> str:
-    cpuinfo = Path("/proc/cpuinfo")
-    found = re.search(r"^model name\s*: (.*)", cpuinfo.read_text(), re.MULTILINE) if cpuinfo.exists() else None
-    return found[1].strip() if found else platform.processor() or platform.machine()
 
 
 def cores() -> int:

@@ -156,7 +156,9 @@ def merge(
         expected = f"the columns, fps, environment and simulator of {first.reference} in all of them"
         faults += [_IMPORTED] if any(source.recorded for source in sources) else []
         raise BadInputError("\n  ".join([f"the datasets do not match: expected {expected}:", *faults]))
-    tasks = list(dict.fromkeys(task for source in sources for task in _tasks(source)))
+    # Episodes have tasks of their own where there are several.
+    of_episodes = [(source.task, task) for source in sources for task in source.metadata.get("task", [None])]
+    tasks = list(dict.fromkeys(usual if task is None else str(task) for usual, task in of_episodes))
     names = _merged_uids(sources, new_uids)
     config = {"datasets": [source.reference for source in sources], "new_uids": new_uids}
     described: dict[str, Any] = {"stage": "merge", "config": config, "name": name, "out": out}
@@ -178,12 +180,6 @@ def _write(source: Dataset, kept: set[int], *, seed: int | None = None, **descri
         for episode in source.episodes(episodes=chosen):
             writer.add(episode)
     return writer.root
-
-
-def _tasks(source: Dataset) -> list[str]:
-    """Return the tasks of its episodes, which have their own where there are several."""
-    tasks = [source.task if task is None else str(task) for task in source.metadata.get("task", [])]
-    return list(dict.fromkeys(tasks)) or [source.task]
 
 
 def _facts(source: Dataset, key: str) -> Sequence[Scalar | None]:

@@ -115,10 +115,6 @@ class Batches:
 class Frames:
     """The steps of E episodes.
 
-        frames = Frames.load(dataset, [STATE, ACTION], episodes=dataset.subset(100))
-        for batch in frames.windows(32).batches(256, seed=0):
-            batch["observation.state"]  # (256, 32, 29)
-
     Attributes:
         columns: name to (N, size), or (N,) where there is one value per step.
         starts: first row of each episode, (E,), ascending.

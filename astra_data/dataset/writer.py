@@ -32,9 +32,6 @@ MOST_CHARACTERS = 2**20  # characters of a text in the metadata
 class DatasetWriter:
     """Writes one dataset atomically.
 
-        with DatasetWriter(root, columns, fps=20, task="reach the goal", description=...) as writer:
-            writer.add(episode)
-
     Leaving the block verifies and commits; after an exception or a kill at any moment, `root` does not exist.
 
     Attributes:
@@ -292,9 +289,6 @@ _SETTINGS = "plan.json"
 
 class StagedWriter:
     """Writes a dataset whose episodes must not be lost, such as those of a robot.
-
-        with StagedWriter(root, columns, fps=20, task="walk", description=..., resume=True) as writer:
-            writer.add(episode)
 
     An episode is safe when `add` returns. Leaving the block writes the dataset; after an exception or a kill
     the episodes stay staged, and a writer with `resume` continues with them.

@@ -61,7 +61,8 @@ class EpisodeSimulator:
         self.simulator.reset_to(state, rows)
         varied = self._varied
         if varied is not None:
-            varied.parameters = varied.variation.redraw(varied.parameters, rows)
+            drawn = varied.variation.draw(len(rows), varied.parameters.device)
+            varied.parameters = varied.parameters.index_copy(0, rows, drawn)
 
     def step(self, action: Tensor) -> Tensor:
         """Apply `action` (B, A); return the new states (B, X)."""

@@ -252,7 +252,8 @@ def _laid_over(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, 
 
 def _check_fit(recipe: Recipe, base: Experiment, path: Path) -> None:
     name, faults, (ours, theirs) = base.path.stem, [], (recipe.task, base.recipe.task)
-    if ours != theirs and not task_named(ours).shares_target(task_named(theirs)):
+    targets = {task_named(task).target_id for task in (ours, theirs)}
+    if ours != theirs and (len(targets) > 1 or None in targets):
         faults = [f"task: expected that of {name}, '{theirs}', or one with the same target, got '{ours}'"]
     for key in ("methods", "seeds"):
         known = getattr(base.recipe, key)

@@ -39,11 +39,6 @@ class WorldConfig(Config):
     data_start_share: Share = 0.0
     """Fraction of the episodes that start from the middle of a recorded one."""
 
-    @property
-    def limits_commands(self) -> bool:
-        """Whether commands are shortened."""
-        return self.command_limit != NO_LIMIT
-
 
 @dataclass(frozen=True)
 class DataStarts:

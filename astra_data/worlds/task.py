@@ -365,10 +365,6 @@ class Task:
         """Whether there is a target to collect in and to test in."""
         return self.robot is not None or self.make_target is not None
 
-    def shares_target(self, other: "Task") -> bool:
-        """Return whether both tasks have the same target and differ only in the simulator."""
-        return self.target_id is not None and self.target_id == other.target_id
-
     @property
     def planar(self) -> Plane:
         """The properties of a task in a maze; BadInputError for others."""

@@ -61,10 +61,6 @@ class Variation(Config):
         low, high = self.ranges().to(device).unbind(-1)
         return low + (high - low) * torch.rand(count, len(low), device=device)
 
-    def redraw(self, parameters: Tensor, rows: Tensor) -> Tensor:
-        """Return `parameters` (B, P) with new ones in the rows `rows` (n,)."""
-        return parameters.index_copy(0, rows, self.draw(len(rows), parameters.device))
-
     def normal(self, parameters: Tensor) -> Tensor:
         """Map parameters (..., P) to -1 at the lower and 1 at the upper end of their ranges, (..., P)."""
         low, high = self.ranges().to(parameters.device).unbind(-1)

@@ -19,6 +19,7 @@ from astra_data.policies.running_policy import POLICY, PolicyFile
 from astra_data.policies.train import Learn, PpoTrainConfig, SacTrainConfig, Training, with_restarts
 from astra_data.reports.artifacts import CURVE
 from astra_data.robots.registry import task_named
+from astra_data.worlds.objective import NO_LIMIT
 
 
 def train(
@@ -69,7 +70,7 @@ def train(
     initial_file = initial and initial / POLICY
     correction = grounding_at(grounding_file, device)
     beginning = PolicyFile.load(initial_file, device) if initial_file else None
-    if beginning and beginning.simulation and beginning.simulation.world.limits_commands:
+    if beginning and beginning.simulation and beginning.simulation.world.command_limit != NO_LIMIT:
         fault = "was trained with command_limit, which has no effect on"
         raise BadInputError(f"{initial} {fault} '{method}': train it without")
     grounding_digest = file_digest(grounding_file) if grounding_file else None
