@@ -17,7 +17,7 @@ from astra_data.dataset.checkup import TURNS
 from astra_data.dataset.columns import Array, Column, Episode, new_uid
 from astra_data.dataset.inspection import outcome_of
 from astra_data.dataset.reader import Dataset
-from astra_data.dataset.versions import next_version
+from astra_data.dataset.versions import Change, next_version
 
 _COMPARED = {"<=": le, ">=": ge, "==": eq, "!=": ne, "<": lt, ">": gt}
 _CONDITION = re.compile(r"\s*(.+?)\s*(<=|>=|==|!=|<|>)\s*(\S+)\s*")
@@ -52,8 +52,11 @@ def trim(
         BadInputError: nothing is asked for, or would be left, or a value in the condition is not known.
     """
     config = {"start_s": start_s, "end_s": end_s, "still": still, "without": without}
-    if not any(config.values()) or start_s < 0 or end_s < 0:
-        raise BadInputError("trim: expected a time at the start or the end, --still or --without a condition, got none")
+    if not (any(config.values()) and 0 <= start_s < np.inf and 0 <= end_s < np.inf):
+        got = f"--start {start_s:g} and --end {end_s:g}" if start_s or end_s else "none"
+        raise BadInputError(
+            f"trim: expected a time of 0 s or more at the start or the end, --still or --without a condition, got {got}"
+        )
     condition = _condition(source, without) if without else None
     first, last = (round(seconds * source.info["fps"]) for seconds in (start_s, end_s))
 
@@ -67,9 +70,8 @@ def trim(
 
     known = set(source.uids.tolist())
     pieces = (piece for episode in source.episodes() for piece in _pieces(episode, kept(episode), source, known))
-    return _write(
-        source, list(source.schema), pieces, source.info["fps"], stage="trim", config=config, name=name, out=out
-    )
+    described = {"stage": "trim", "config": config, "name": name, "out": out}
+    return _write(source, "episodes", source.schema, pieces, source.info["fps"], **described)
 
 
 def resample(source: Dataset, fps: int, *, name: str | None = None, out: Path | None = None) -> Path:
@@ -92,12 +94,14 @@ def resample(source: Dataset, fps: int, *, name: str | None = None, out: Path | 
     schema = [column for column in source.schema if not column.name.startswith("abstract.")]
     slower = (slow for episode in source.episodes() if (slow := _resampled(episode, schema, source.info["fps"], fps)))
     config = {"fps": fps, "from_fps": source.info["fps"]}
-    return _write(source, schema, slower, fps, stage="resample", config=config, name=name, out=out)
+    return _write(source, "columns", schema, slower, fps, stage="resample", config=config, name=name, out=out)
 
 
-def _write(source: Dataset, schema: list[Column], episodes: Iterator[Episode], fps: int, **described: Any) -> Path:
+def _write(
+    source: Dataset, change: Change, schema: Sequence[Column], episodes: Iterator[Episode], fps: int, **described: Any
+) -> Path:
     """Write the episodes as the next version, `described` as `next_version` takes it."""
-    with next_version(source, "columns", fps=fps, schema=schema, **described) as writer:
+    with next_version(source, change, fps=fps, schema=schema, **described) as writer:
         count = 0
         for count, episode in enumerate(episodes, start=1):  # noqa: B007
             writer.add(episode)

@@ -1,6 +1,6 @@
 """What paired episodes say before any fit: delays, what the simulator misses, hidden state, what was never tried."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,13 +19,14 @@ from astra_data.worlds.commands import Commands
 from astra_data.worlds.protocols import AbstractSimulator
 
 LONGEST_S, LONGEST_STEPS = 2.0, 20  # longest delay that is looked for: the shorter of the two
-FEWEST = 8  # recordings from which on a forecast is made
-_SIMULATED = 400_000  # simulated steps for the responses; of more, a random share is used
+FEWEST = 10  # recordings from which on a forecast is made
+_SIMULATED = 1_000_000  # simulated steps for the responses; of more, a random share is used
 _REFITS, _FORECASTS, _FOLDS = 200, 12, 5
 _PAST_STEPS = 8  # steps of a history from which the simulator's error is predicted
 _MOST_SQUARED = 16  # values whose products are features as well; of more, only the values
 _VISIBLE = 0.1  # share of the simulator's response below which a command has no visible effect
 _MATTERS = 0.05  # explained variance from which on what it adds is worth a sentence
+_HARDLY = 0.01  # share of the simulator's squared error that is not worth more recordings
 _FEW_FAILURES = 10
 
 
@@ -71,11 +72,7 @@ class Forecast:
     left: Floats
     more: int  # half as many recordings again
     expected: tuple[float, float, float]  # what is left with that many: value, low, high
-
-    @property
-    def is_enough(self) -> bool:
-        """Whether half as many recordings again take away less than a twentieth of what is left."""
-        return float(np.median(self.left[-1])) - self.expected[0] < 0.05 * float(np.median(self.left[-1]))
+    gain: tuple[float, float, float]  # by which share of what is left now it is less then: value, low, high
 
 
 @dataclass(frozen=True)
@@ -83,10 +80,13 @@ class Diagnosis:
     """What the recorded episodes say; see the module."""
 
     reference: str
+    recordings: int
+    steps: int
     responses: tuple[Response, ...]
     best_shift: int  # steps by which the commands are shifted where the simulator's one-step error is least
     missed: tuple[Missed, ...]
-    explained: dict[str, float]  # R² of the simulator's error on held-out recordings, by what predicts it; 0 or more
+    commands: dict[str, tuple[float, float, float, float]]  # given, its 1 and 99 %; bounds, low and high
+    explained: dict[str, Floats]  # what predicts the error → held-out R² (1 + refits), of all, of resampled recordings
     forecast: Forecast | None  # None of fewer than `FEWEST` recordings
     findings: tuple[Finding, ...]
 
@@ -105,24 +105,36 @@ def diagnose(dataset: str | Path, simulator: str) -> Diagnosis:
     if keys.ABSTRACT_STATE not in source.features:
         raise BadInputError(f"{source.root} has no column {keys.ABSTRACT_STATE}: expected a dataset that was paired")
     log = _Log.of(source)
-    names = next(column for column in source.schema if column.name == keys.ACTION).labels
-    bounds = pairing.commands or Commands.recorded(dataset)
-    responses, best_shift = _responses(log, pairing, names, source.info["fps"])
+    labels = {column.name: column.labels for column in source.schema}
+    names = labels[keys.ACTION]
+    commands = _commands(log, names, pairing.commands)
+    felt = _Felt.of(log, pairing, source.info["fps"])
+    responses = _responses(log, felt, names, source.info["fps"])
     missed = _missed(log, pairing)
-    error, aged = _errors(log), log.step >= _PAST_STEPS
-    present, history = _histories(log, error)
-    explained = _explained(log, error, aged, present, history) if error.size else {}
-    may_forecast = error.size and log.recording.max() + 1 >= FEWEST
-    forecast = _forecast(history[aged], error[aged], log.recording[aged]) if may_forecast else None
+    recordings, known = len(np.unique(log.recording)), _Error.of(log, felt)
+    may_explain = known.error.size and recordings > 1
+    explained, shown = _explained(log, known, labels[keys.STATE]) if may_explain else ({}, [])
+    forecast = _forecast(known) if known.error.size and recordings >= FEWEST else None
     findings = (
         *_of_responses(responses, source.info["fps"]),
-        *_of_hidden_state(explained),
-        *_of_commands(log, names, bounds),
+        *_of_hidden_state([*explained.values()], shown),
+        *_of_commands(log, commands),
         *_of_rates(log, source.info["fps"]),
         *_of_failures(source, log),
         *_of_forecast(forecast, missed),
     )
-    return Diagnosis(source.reference, responses, best_shift, missed, explained, forecast, tuple(findings))
+    return Diagnosis(
+        source.reference,
+        recordings,
+        len(log.step),
+        responses,
+        felt.best_shift,
+        missed,
+        commands,
+        explained,
+        forecast,
+        findings,
+    )
 
 
 @dataclass(frozen=True)
@@ -164,36 +176,55 @@ class _Log:
         return np.asarray(values[np.where(self.step >= steps, rows - steps, rows)])
 
 
-def _responses(log: _Log, pairing: Pairing, names: Sequence[str], fps: float) -> tuple[tuple[Response, ...], int]:
-    lags = min(LONGEST_STEPS, int(LONGEST_S * fps), int(log.step.max()))
-    rows = np.flatnonzero(log.step >= lags)
-    size = log.action.shape[1]
-    count = max(1, _SIMULATED // (size * (lags + 1)))
-    if len(rows) > count:
-        rows = np.sort(np.random.default_rng(0).choice(rows, count, replace=False))
-    middle, simulators = log.action[rows].mean(axis=0), built(pairing, len(rows))
-    alone = _moved(simulators, log.state[rows], np.broadcast_to(middle, (len(rows), size)))
-    moved = log.next_state[rows] - alone
-    scale = moved.std(axis=0)
-    used = scale > 1e-9 * max(1.0, float(np.abs(log.state).max()))
-    scale, errors = np.where(used, scale, 1.0), []
-    features = np.empty((len(rows), size * (lags + 1), int(used.sum())))
-    for lag in range(lags + 1):
-        past = log.action[rows - lag]
-        apart = (_moved(simulators, log.state[rows], past) - log.next_state[rows]) / scale
-        errors.append(float((apart[:, used] ** 2).mean()) if used.any() else 0.0)
-        for axis in range(size):
-            one = np.tile(middle, (len(rows), 1))
-            one[:, axis] = past[:, axis]
-            felt = (_moved(simulators, log.state[rows], one) - alone) / scale
-            features[:, axis * (lags + 1) + lag] = felt[:, used]
-    weights = _refitted(features, (moved / scale)[:, used], log.recording[rows], size).reshape(-1, size, lags + 1)
+@dataclass(frozen=True)
+class _Felt:
+    """What the simulator does from the states of N rows with past commands; `alone` (N, X), with the mean command."""
+
+    rows: Ints
+    alone: Floats
+    changes: Floats  # (N, A, K + 1, X): where a command of K steps before takes it, by axis, less `alone`
+    scale: Floats  # of the robot's motion, (X,); of values that do not move, 1
+    used: Bools  # the values that move
+    best_shift: int
+
+    @classmethod
+    def of(cls, log: _Log, pairing: Pairing, fps: float) -> "_Felt":
+        lengths = log.step[np.flatnonzero(np.diff(log.step, append=0) <= 0)] + 1
+        lags = max(1, min(LONGEST_STEPS, int(LONGEST_S * fps), int(np.median(lengths)) // 2))
+        rows, size = np.flatnonzero(log.step >= lags), log.action.shape[1]
+        if not len(rows):
+            raise BadInputError(f"expected an episode of {lags + 1} steps or more, got {lengths.max()}")
+        count = max(1, _SIMULATED // (size * (lags + 1)))
+        if len(rows) > count:
+            rows = np.sort(np.random.default_rng(0).choice(rows, count, replace=False))
+        middle, simulators = log.action.mean(axis=0), built(pairing, len(rows))
+        alone = _moved(simulators, log.state[rows], np.broadcast_to(middle, (len(rows), size)))
+        scale = (log.next_state[rows] - alone).std(axis=0)
+        used = scale > 1e-9 * max(1.0, float(np.abs(log.state).max()))
+        scale, errors = np.where(used, scale, 1.0), []
+        changes = np.empty((len(rows), size, lags + 1, len(scale)))
+        for lag in range(lags + 1):
+            past = log.action[rows - lag]
+            apart = (_moved(simulators, log.state[rows], past) - log.next_state[rows]) / scale
+            errors.append(float((apart[:, used] ** 2).sum()))
+            for axis in range(size):
+                one = np.tile(middle, (len(rows), 1))
+                one[:, axis] = past[:, axis]
+                changes[:, axis, lag] = _moved(simulators, log.state[rows], one) - alone
+        return cls(rows, alone, changes, scale, used, int(np.argmin(errors)))
+
+
+def _responses(log: _Log, felt: _Felt, names: Sequence[str], fps: float) -> tuple[Response, ...]:
+    _, size, lags, _ = felt.changes.shape
+    features = (felt.changes / felt.scale)[..., felt.used].reshape(len(felt.rows), size * lags, -1)
+    moved = ((log.next_state[felt.rows] - felt.alone) / felt.scale)[:, felt.used]
+    weights = _refitted(features, moved, log.recording[felt.rows], size).reshape(-1, size, lags)
     found = []
     for axis, name in enumerate(names):
         gain = weights[:, axis].sum(axis=1)
-        delay = weights[:, axis] @ np.arange(lags + 1) / np.where(np.abs(gain) > 1e-9, gain, np.nan) / fps
-        found.append(Response(name, weights[0, axis], _with_ends(gain), _with_ends(delay)))
-    return tuple(found), int(np.argmin(errors))
+        delay = weights[:, axis] @ np.arange(lags) / np.where(np.abs(gain) > 1e-9, gain, np.nan) / fps
+        found.append(Response(name, weights[0, axis], with_ends(gain), with_ends(delay)))
+    return tuple(found)
 
 
 def _moved(simulators: AbstractSimulator, state: Floats, action: Floats) -> Floats:
@@ -214,8 +245,7 @@ def _refitted(features: Floats, moved: Floats, recording: Ints, axes: int) -> Fl
         rows = of == number
         flat = features[rows].transpose(0, 2, 1).reshape(-1, size)
         squares[number], products[number] = flat.T @ flat, flat.T @ moved[rows].ravel()
-    draws = np.random.default_rng(0).multinomial(len(known), np.full(len(known), 1 / len(known)), _REFITS)
-    counts = np.concatenate([np.ones((1, len(known))), draws])
+    counts = _resampled(len(known))
     whole, right = np.tensordot(counts, squares, 1), counts @ products
     whole += (1e-6 * np.trace(whole[0]) / size + 1e-12) * np.eye(size)
     lag, criterion, best = np.arange(size) % (size // axes), np.inf, np.zeros_like(right)
@@ -232,7 +262,8 @@ def _refitted(features: Floats, moved: Floats, recording: Ints, axes: int) -> Fl
     return best
 
 
-def _with_ends(values: Floats) -> tuple[float, float, float]:
+def with_ends(values: Floats) -> tuple[float, float, float]:
+    """Return the first of a bootstrap's values, which is that of all recordings, and the 95 % interval of the rest."""
     low, high = np.nanpercentile(values[1:], [2.5, 97.5]) if np.isfinite(values[1:]).any() else (np.nan, np.nan)
     return float(values[0]), float(low), float(high)
 
@@ -261,28 +292,80 @@ def _missed(log: _Log, pairing: Pairing) -> tuple[Missed, ...]:
     return tuple(found)
 
 
-def _errors(log: _Log) -> Floats:
-    """Return the simulator's errors (N, X'), in the values in which it makes any after a history."""
-    error = log.error[log.step >= _PAST_STEPS]
-    moved = np.abs(log.next_state - log.state).max(axis=0) + 1e-12
-    return log.error[:, error.std(axis=0) > 1e-6 * moved] if len(error) else log.error[:, :0]
+@dataclass(frozen=True)
+class _Error:
+    """The simulator's errors (N, X') in the values in which it makes any; `recording` (N,) numbers from 0.
+
+    Features of the present are (N, D), a constant among them; past commands, as the simulator feels them from
+    here, (X', N, D'); past errors (N, D'').
+    """
+
+    rows: Ints
+    error: Floats
+    recording: Ints
+    present: Floats
+    commands: Floats
+    past: Floats
+
+    @classmethod
+    def of(cls, log: _Log, felt: _Felt) -> "_Error":
+        made = log.next_state - log.landed
+        moved = np.abs(log.next_state - log.state).max(axis=0) + 1e-12
+        wrong = made[felt.rows].std(axis=0) > 1e-6 * moved
+        commands = felt.changes[:, :, 1 : _PAST_STEPS + 1, wrong]
+        past = [log.before(made[:, wrong], steps)[felt.rows] for steps in range(1, _PAST_STEPS + 1)]
+        return cls(
+            felt.rows,
+            made[felt.rows][:, wrong],
+            np.unique(log.recording[felt.rows], return_inverse=True)[1],
+            _products(np.concatenate([log.state, log.action], axis=1)[felt.rows]),
+            commands.reshape(len(felt.rows), -1, int(wrong.sum())).transpose(2, 0, 1),
+            np.concatenate(past, axis=1),
+        )
+
+    def left(self, sets: Sequence[Floats], fitted: Bools, out: Bools) -> Floats:
+        """Return what a ridge regression on `sets` of features, fitted to some rows, leaves of others."""
+        left = np.empty_like(self.error[out])
+        for index in range(left.shape[1]):
+            features = np.concatenate([one[index] if one.ndim == 3 else one for one in sets], axis=1)
+            known = features[fitted]
+            square = known.T @ known
+            ridge = np.diag(1e-3 * square.diagonal() + 1e-12)
+            weights = np.linalg.solve(square + ridge, known.T @ self.error[fitted, index])
+            left[:, index] = self.error[out, index] - features[out] @ weights
+        return left
 
 
-def _histories(log: _Log, error: Floats) -> tuple[Floats, Floats]:
-    """Return features of the present, (N, D), a constant among them, and those with the past steps as well."""
-    present = _products(np.concatenate([log.state, log.action], axis=1))
-    past = [log.before(values, steps) for steps in range(1, _PAST_STEPS + 1) for values in (error, log.action)]
-    return present, np.concatenate([present, *past], axis=1)
-
-
-def _explained(log: _Log, error: Floats, aged: Bools, present: Floats, history: Floats) -> dict[str, float]:
-    """Return how much of the simulator's error is predicted from the present, the past, and all that is recorded."""
+def _explained(log: _Log, known: _Error, values: Sequence[str]) -> tuple[dict[str, Floats], list[str]]:
+    """Return R² by what predicts the error, and those of the recorded `values` that show what histories leave of it."""
+    steps = f"{min(_PAST_STEPS, known.past.shape[1])} steps before"
+    recorded = np.concatenate([log.target_state, log.action], axis=1)[known.rows]
     sets = {
-        "the present abstract state and command": present,
-        f"a history of {_PAST_STEPS} steps": history,
-        "the robot's whole recorded state": _products(np.concatenate([log.target_state, log.action], axis=1)),
+        "the present abstract state and command": [known.present],
+        f"and the commands of {steps}": [known.present, known.commands],
+        f"and the errors of {steps}": [known.present, known.commands, known.past],
+        "instead, the robot's whole recorded state and command": [_products(recorded)],
     }
-    return {name: _held_out_r2(values[aged], error[aged], log.recording[aged]) for name, values in sets.items()}
+    count, left = int(known.recording.max()) + 1, {}
+    fold = np.random.default_rng(0).permutation(count)[known.recording] % min(_FOLDS, count)
+    for name, features in sets.items():
+        left[name] = np.empty_like(known.error)
+        for number in np.unique(fold):
+            left[name][fold == number] = known.left(features, fold != number, fold == number)
+    counts, member = _resampled(count), known.recording == np.arange(count)[:, None]
+    whole = counts @ (member @ (known.error - known.error.mean(axis=0)) ** 2)
+    r2 = {name: np.maximum(0.0, 1 - counts @ (member @ wrong**2) / whole).mean(axis=-1) for name, wrong in left.items()}
+    state, rest = log.target_state[known.rows], [*left.values()][2]
+    state = (state - state.mean(axis=0)) / (state.std(axis=0) + 1e-9)
+    shares = (state.T @ (rest / rest.std(axis=0)) / len(state)) ** 2
+    order = np.argsort(-shares.max(axis=1), kind="stable")[:3]
+    return r2, [values[one] for one in order if shares[one].max() > _MATTERS / 2]
+
+
+def _resampled(count: int) -> Floats:
+    """Return how often each of `count` recordings counts, (1 + refits, count): once, then as a bootstrap draws them."""
+    draws = np.random.default_rng(0).multinomial(count, np.full(count, 1 / count), _REFITS)
+    return np.concatenate([np.ones((1, count)), draws])
 
 
 def _products(values: Floats) -> Floats:
@@ -291,60 +374,48 @@ def _products(values: Floats) -> Floats:
     return np.concatenate([np.ones((len(values), 1)), scaled, scaled[:, first] * scaled[:, second]], axis=1)
 
 
-def _held_out_r2(features: Floats, error: Floats, recording: Ints) -> float:
-    known, of = np.unique(recording, return_inverse=True)
-    fold = np.random.default_rng(0).permutation(len(known))[of] % min(_FOLDS, len(known))
-    if len(known) < 2:
-        return float("nan")
-    left = np.empty_like(error)
-    for number in np.unique(fold):
-        out: Bools = fold == number
-        left[out] = error[out] - features[out] @ _ridge(features[~out], error[~out])
-    return max(0.0, float(np.mean(1 - (left**2).mean(axis=0) / error.var(axis=0))))
-
-
-def _ridge(features: Floats, error: Floats) -> Floats:
-    square = features.T @ features
-    ridge = 1e-3 * np.trace(square) / len(square) * np.eye(len(square))
-    return np.asarray(np.linalg.solve(square + ridge, features.T @ error))
-
-
-def _forecast(features: Floats, error: Floats, recording: Ints) -> Forecast:
-    error = error / error.std(axis=0)
-    known, rng = np.unique(recording), np.random.default_rng(0)
-    fitted = len(known) - max(1, len(known) // 5)
-    sizes = tuple(sorted({max(2, round(fitted * share)) for share in (0.2, 0.35, 0.6, 1.0)}))
+def _forecast(known: _Error) -> Forecast:
+    sets, variance = [known.present, known.commands, known.past], known.error.var(axis=0)
+    count, rng = int(known.recording.max()) + 1, np.random.default_rng(0)
+    fitted = count - max(1, count // 5)
+    sizes = tuple(sorted({max(2, round(fitted * share)) for share in (0.35, 0.5, 0.7, 1.0)}))
     left = np.empty((len(sizes), _FORECASTS))
     for refit in range(_FORECASTS):
-        order = rng.permutation(known)
-        out = np.isin(recording, order[fitted:])
+        order = rng.permutation(count)
+        out = np.isin(known.recording, order[fitted:])
         for number, size in enumerate(sizes):
-            rows = np.isin(recording, order[:size])
-            wrong = error[out] - features[out] @ _ridge(features[rows], error[rows])
-            left[number, refit] = float((wrong**2).mean() / (error[out] ** 2).mean())
-    # The error that is left falls with 1 / recordings, to what no number of them explains.
-    more = round(1.5 * len(known))
-    line = np.stack([np.ones(len(sizes)), 1 / np.array(sizes)], axis=1)
-    at = np.array([1.0, 1 / more]) @ np.linalg.lstsq(line[-3:], left[-3:], rcond=None)[0]
-    low, middle, high = (float(value) for value in np.percentile(at, [2.5, 50, 97.5]))
-    return Forecast(sizes, left, more, (middle, low, high))
+            wrong = known.left(sets, np.isin(known.recording, order[:size]), out)
+            left[number, refit] = float(np.minimum(1.0, (wrong**2).mean(axis=0) / variance).mean())
+    # To what no number of recordings explains; faster than with 1 / recordings, as that of least squares does.
+    more = round(1.5 * count)
+    (before, last), (less, now) = 1 / np.square(sizes[-2:], dtype=float), left[-2:]
+    at = np.maximum(0.0, now + (now - less) * (1 / more**2 - last) / (last - before))
+    expected, gain = (_of_refits(values) for values in (at, 1 - at / left[-1]))
+    return Forecast(sizes, left, more, expected, gain)
+
+
+def _of_refits(values: Floats) -> tuple[float, float, float]:
+    low, middle, high = (float(value) for value in np.percentile(values, [2.5, 50, 97.5]))
+    return middle, low, high
 
 
 def _of_forecast(forecast: Forecast | None, missed: Sequence[Missed]) -> Iterator[Finding]:
     if forecast is None:
         yield Finding("warning", "too few recordings for a forecast", f"record {FEWEST} or more")
         return
-    now, (then, low, high) = float(np.median(forecast.left[-1])), forecast.expected
-    then_text = f"{then:.2f} [{low:.2f}, {high:.2f}]"
-    what = f"of the simulator's error, {now:.2f} are left, with {forecast.more} recordings {then_text}"
-    if forecast.is_enough:
+    now, (then, low, high), (gain, least, _) = float(np.median(forecast.left[-1])), forecast.expected, forecast.gain
+    what = (
+        f"of the simulator's error, histories leave {now:.2f}, with {forecast.more} "
+        f"recordings {then:.2f} [{low:.2f}, {high:.2f}]"
+    )
+    where = [one.where.partition("where ")[2].removesuffix(" as where not") for one in missed if one.where]
+    above = f", above all where {' and where '.join(dict.fromkeys(where))}" if where else ""
+    if gain < _MATTERS or now - then < _HARDLY:
         yield Finding("note", what, "these are enough: more of the same make hardly a difference")
+    elif least > 0:
+        yield Finding("note", what, f"record more{above}")
     else:
-        kinds = list(
-            dict.fromkeys(one.where.partition("where ")[2].removesuffix(" as where not") for one in missed if one.where)
-        )
-        most = f", above all where {' and where '.join(kinds)}" if kinds else ""
-        yield Finding("note", what, f"record more{most}")
+        yield Finding("note", what, f"more may help or not: record some more{above}, and look again")
 
 
 def _of_responses(responses: Sequence[Response], fps: float) -> Iterator[Finding]:
@@ -365,25 +436,49 @@ def _of_responses(responses: Sequence[Response], fps: float) -> Iterator[Finding
             )
 
 
-def _of_hidden_state(explained: dict[str, float]) -> Iterator[Finding]:
-    if not explained or np.isnan([*explained.values()]).any():
+def _of_hidden_state(explained: Sequence[Floats], shown: Sequence[str]) -> Iterator[Finding]:
+    if not explained:
         return
-    present, history, recorded = explained.values()
-    what = f"of the simulator's error, the present explains {present:.2f}, a history {history:.2f}"
-    if history > present + _MATTERS:
-        yield Finding("note", what, "there is state that no single abstract state shows: train `astra`")
-    elif present > _MATTERS:
-        yield Finding("note", what, "nothing hidden shows: `nas`, or a parameter of the simulator, may do")
-    if recorded > history + _MATTERS:
-        advice = "the simulator may gain from more of the state in φ"
-        yield Finding("note", f"the robot's whole recorded state explains {recorded:.2f} of it", advice)
+    present, late, history, recorded = explained
+
+    def adds(more: Floats, less: Floats) -> bool:
+        value, low, _ = with_ends(more - less)
+        return value > _MATTERS and low > 0
+
+    what = (
+        f"of the simulator's error, the present explains {present[0]:.2f}, with the past commands {late[0]:.2f}, "
+        f"with the past errors {history[0]:.2f}"
+    )
+    if adds(history, late):
+        yield Finding(
+            "note", what, "there is state that neither the abstract state nor commands show: train `astra_plus`"
+        )
+    elif adds(late, present):
+        yield Finding("note", what, "a delay or a lag of the commands is what is hidden: any grounding learns it")
+    elif present[0] > _MATTERS:
+        yield Finding(
+            "note", what, "for the motion nothing hidden shows: `nas`, or a parameter of the simulator, may do"
+        )
+    if adds(recorded, history):
+        which = f", such as {' and '.join(shown)}," if shown else ""
+        advice = f"the simulator may gain from more of it{which} in φ"
+        yield Finding("note", f"the robot's whole recorded state explains {recorded[0]:.2f} of it", advice)
 
 
-def _of_commands(log: _Log, names: Sequence[str], bounds: Commands) -> Iterator[Finding]:
-    for index, (name, (low, high)) in enumerate(zip(names, bounds.values(), strict=True)):
-        least, largest = np.quantile(log.action[:, index], [0.01, 0.99])
-        share = (min(largest, high) - max(least, low)) / (high - low)
-        if share < 0.5:
+def _commands(log: _Log, names: Sequence[str], bounds: Commands | None) -> dict[str, tuple[float, float, float, float]]:
+    """Return the 1 and 99 % quantiles of each command, and its bounds, by default the recorded ones."""
+    given = np.quantile(log.action, [0.01, 0.99, 0.0, 1.0], axis=0).T
+    if bounds:
+        given[:, 2:] = [*bounds.values()]
+    return {name: tuple(row) for name, row in zip(names, given.tolist(), strict=True)}
+
+
+def _of_commands(log: _Log, commands: Mapping[str, tuple[float, float, float, float]]) -> Iterator[Finding]:
+    for index, (name, (least, largest, low, high)) in enumerate(commands.items()):
+        if np.ptp(log.action[:, index]) == 0:
+            advice = "no grounding knows what it does: record it varied, or leave it out of the commands"
+            yield Finding("warning", f"{name} never changes", advice)
+        elif min(largest, high) - max(least, low) < 0.5 * (high - low):
             yield Finding(
                 "warning",
                 f"{name} was given between {least:.3g} and {largest:.3g} alone, of {low:.3g} to {high:.3g}",
@@ -392,7 +487,7 @@ def _of_commands(log: _Log, names: Sequence[str], bounds: Commands) -> Iterator[
     scaled = (log.action - log.action.mean(axis=0)) / (log.action.std(axis=0) + 1e-9)
     values, directions = np.linalg.eigh(scaled.T @ scaled / len(scaled))
     if len(values) > 1 and values[0] < 0.02 * values[-1] and log.action.std(axis=0).min() > 0:
-        together = " and ".join(np.array(names)[np.abs(directions[:, 0]) > 0.3])
+        together = " and ".join(np.array([*commands])[np.abs(directions[:, 0]) > 0.3])
         yield Finding("warning", f"{together} only ever vary together", "vary them one at a time: their effects mix")
 
 

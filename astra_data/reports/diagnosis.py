@@ -3,7 +3,7 @@
 import numpy as np
 
 from astra_data.core.arrays import Floats
-from astra_data.grounding.diagnosis import Diagnosis
+from astra_data.grounding.diagnosis import Diagnosis, with_ends
 from astra_data.reports.blocks import Section, TableBlock, Text, code, markdown
 
 DIAGNOSIS = "diagnosis.md"
@@ -21,25 +21,40 @@ def diagnosis_page(recipe: str, found: Diagnosis, timestep_s: float) -> str:
         [one.name, one.unit or "1", f"{one.error:.3g}", f"{one.still:.3g}", one.where or "everywhere alike"]
         for one in found.missed
     ]
-    about = Text(f"What {code(found.reference)} and the abstract simulator say before anything is fitted.")
+    about = Text(
+        f"What {code(found.reference)} ({found.recordings} recordings, {found.steps} steps) and the abstract simulator "
+        "say before anything is fitted."
+    )
+    given = [[name, *(f"{value:.3g}" for value in ends)] for name, ends in found.commands.items()]
     shape = f"response by step of {timestep_s:g} s"
     meaning = Text(
         "The robot's motion as a sum of what the simulator does for the present and the past commands: effect is the "
         "sum of their shares (1: as much as in the simulator), delay their mean lag, dead time and time constant "
-        f"together. Intervals are a bootstrap over recordings. With commands shifted by {found.best_shift} steps, the "
-        "simulator's one-step error is least."
+        f"together. Intervals are a bootstrap over recordings. Of single shifts of all commands, {found.best_shift} of "
+        "these steps leave the least one-step error; where a lag spreads an effect over many steps, that is less than "
+        "the mean."
     )
+    given_table = TableBlock("", ["command", "1 % lie below", "99 % lie below", "lower bound", "upper bound"], given)
     delay_table = TableBlock("", ["command", "delay (s) [95 %]", "effect [95 %]", shape], delays)
-    missed_table = TableBlock("", ["value", "unit", "error (RMS)", "persistence baseline", "where"], missed, words=2)
+    missed_table = TableBlock(
+        "", ["value", "unit", "error (RMS)", "no motion (persistence baseline)", "where"], missed, words=2
+    )
     sections = [
         Section("", [about, Text("" if findings else "Nothing that needs attention.", findings)]),
         Section("Delay of each command", [delay_table, meaning]),
+        Section("Commands that were given", [given_table]),
         Section("What the simulator misses, one step ahead", [missed_table]),
     ]
     if found.explained:
-        lines = [[name, f"{value:.2f}"] for name, value in found.explained.items()]
-        text = "Ridge regression on held-out recordings (R²; 0: nothing, 1: all of it)."
-        sections.append(Section("What explains that error", [TableBlock("", ["from", "explained"], lines), Text(text)]))
+        lines = [[name, _with_ends(with_ends(value), 2)] for name, value in found.explained.items()]
+        text = (
+            "R² on held-out recordings (0: nothing, 1: all of it), mean over the values that it misses, of a "
+            "ridge regression on the values, and on the products of two where there are few. What each line explains "
+            "beyond the one above: past commands, a delay or a lag; past errors, other state that is hidden."
+        )
+        sections.append(
+            Section("What explains that error", [TableBlock("", ["from", "explained [95 %]"], lines), Text(text)])
+        )
     if found.forecast:
         sizes, left = found.forecast.sizes, found.forecast.left
         lines = [
@@ -49,16 +64,17 @@ def diagnosis_page(recipe: str, found: Diagnosis, timestep_s: float) -> str:
         lines.append([f"{found.forecast.more} (forecast)", *(f"{value:.2f}" for value in found.forecast.expected)])
         text = (
             "Share of the simulator's squared error that a ridge regression on histories leaves on held-out "
-            "recordings, refitted to random ones; a grounding leaves less, and what it leaves falls alike."
+            "recordings, refitted to random ones: those of the "
+            f"{found.recordings} that are long enough. A grounding leaves less, and what it leaves falls alike."
         )
         table = TableBlock("", ["recordings", "left", "2.5 %", "97.5 %"], lines)
         sections.append(Section("Enough recordings?", [table, Text(text)]))
     return markdown(f"{recipe}: before any fit", sections)
 
 
-def _with_ends(values: tuple[float, float, float]) -> str:
-    value, low, high = values
-    return f"{value:.2f} [{low:.2f}, {high:.2f}]"
+def _with_ends(values: tuple[float, float, float], digits: int = 3) -> str:
+    value, low, high = (f"{round(value, digits) + 0.0:.{digits}f}" for value in values)  # never -0.00
+    return f"{value} [{low}, {high}]"
 
 
 def _bars(weights: Floats) -> str:

@@ -92,7 +92,9 @@ def test_still_ends_go_and_pauses_stay(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("asked", "message"),
     [
-        ({}, "expected a time at the start or the end"),
+        ({}, "expected a time of 0 s or more at the start or the end, --still or --without a condition, got none"),
+        ({"start_s": float("inf")}, "got --start inf and --end 0"),
+        ({"end_s": float("nan")}, "got --start 0 and --end nan"),
         ({"start_s": 99.0}, "nothing of its 5 episodes would be left"),
         ({"without": "mode"}, "expected a condition such as 'v < 0.05'"),
         ({"without": "x < near"}, "expected a condition such as 'v < 0.05'"),
