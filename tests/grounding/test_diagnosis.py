@@ -61,7 +61,8 @@ def recorded(
             if same is not None:
                 command[:, 1] = command[:, 0] if same else 0.5
             state = np.zeros((151, 5))
-            state[:, 4] = {"steady": rng.normal(), "gusts": rng.normal(size=151)}.get(drift, 0.0)
+            currents = {"steady": np.full(151, rng.normal()), "gusts": rng.normal(size=151)}
+            state[:, 4] = currents.get(drift, np.zeros(151))
             for step in range(150):
                 told = [command[10 + step - dead[axis], axis] for axis in (0, 1)]
                 velocity = state[step, 2:4] + follows * (np.array(told) * gains - state[step, 2:4])
