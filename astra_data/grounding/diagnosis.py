@@ -42,6 +42,7 @@ class Response:
     weights: Floats
     gain: tuple[float, float, float]  # sum of the weights: value, low, high; 1 if as far as in the simulator
     delay_s: tuple[float, float, float]  # mean lag, dead time and time constant together: value, low, high
+    is_simulated: bool  # whether it moves the simulator
 
     @property
     def is_visible(self) -> bool:
@@ -223,7 +224,8 @@ def _responses(log: _Log, felt: _Felt, names: Sequence[str], fps: float) -> tupl
     for axis, name in enumerate(names):
         gain = weights[:, axis].sum(axis=1)
         delay = weights[:, axis] @ np.arange(lags) / np.where(np.abs(gain) > 1e-9, gain, np.nan) / fps
-        found.append(Response(name, weights[0, axis], with_ends(gain), with_ends(delay)))
+        is_simulated = bool(np.abs(felt.changes[:, axis]).max() > 0)
+        found.append(Response(name, weights[0, axis], with_ends(gain), with_ends(delay), is_simulated))
     return tuple(found)
 
 
@@ -280,14 +282,14 @@ def _missed(log: _Log, pairing: Pairing) -> tuple[Missed, ...]:
             )
     for index, (name, unit) in enumerate(zip(column.labels, column.units, strict=True)):
         square = log.error[:, index] ** 2
-        where, most = "", 1.5
+        still = np.sqrt(((log.next_state - log.state)[:, index] ** 2).mean())
+        where, most = "", 1.5 if square.mean() > (1e-3 * still) ** 2 else np.inf  # not of rounding errors
         for factor, values in factors.items():
             low, high = np.quantile(values, [1 / 3, 2 / 3])
             least, largest = (np.sqrt(square[part].mean()) for part in (values <= low, values >= high))
             if least > 0 and largest / least > most:
                 most = float(largest / least)
                 where = f"{most:.1f} times as large where {factor} as where not"
-        still = np.sqrt(((log.next_state - log.state)[:, index] ** 2).mean())
         found.append(Missed(name, unit, float(np.sqrt(square.mean())), float(still), where))
     return tuple(found)
 
@@ -421,7 +423,10 @@ def _of_forecast(forecast: Forecast | None, missed: Sequence[Missed]) -> Iterato
 def _of_responses(responses: Sequence[Response], fps: float) -> Iterator[Finding]:
     for one in responses:
         (delay, low, high), half = one.delay_s, 0.5 / fps
-        if not one.is_visible:
+        if not one.is_simulated:
+            advice = "that of the robot is not seen either: model it, or leave it out of the commands"
+            yield Finding("note", f"{one.name} has no effect in the simulator", advice)
+        elif not one.is_visible:
             yield Finding(
                 "warning",
                 f"{one.name} has no effect that can be seen ({one.gain[0]:.2f} of the simulator's)",

@@ -44,12 +44,15 @@ def recorded(
     gains: tuple[float, float] = (0.9, 0.5),
     held: int = 1,
     drift: str = "",
+    deaf: bool = False,
 ) -> Diagnosis:
     """Return the diagnosis of 12 recordings of 150 steps, in which commands act `dead` steps late and with a lag.
 
     The state is repeated for `held` steps. A current moves x, the same in a recording or drawn in each step.
     """
-    (folder / "axes.py").write_text(SIMULATOR)
+    (folder / "axes.py").write_text(
+        SIMULATOR.replace("* action", "* action * torch.tensor([0.9, 0.0])") if deaf else SIMULATOR
+    )
     rng, follows = np.random.default_rng(0), 1.0 if not lag_s else 1 - np.exp(-0.1 / lag_s)
     columns = [Column(STATE, size=5, names=("x", "y", "vx", "vy", "current")), Column(NEXT_STATE, size=5)]
     columns += [Column(ACTION, size=2, names=("pull", "push"))]
@@ -138,6 +141,15 @@ def test_a_command_without_effect_and_a_slow_sensor_are_warned_of(tmp_path: Path
     assert not any(what.startswith("pull has") for what in whats)
     [rate] = [what for what in whats if what.endswith(" times a second, of 10 rows")]
     assert float(rate.split()[2]) == pytest.approx(5, abs=0.1)
+
+
+def test_a_command_that_the_simulator_ignores_is_named(tmp_path: Path) -> None:
+    found = recorded(tmp_path, deaf=True)
+    [line] = [line for line in found.findings if line.what == "push has no effect in the simulator"]
+    assert line.severity == "note" and not found.responses[1].weights.any()
+    # Where it only rounds, there is no place where it errs more.
+    x, y = found.missed
+    assert x.error < 1e-6 and not x.where and y.error == pytest.approx(0.1 * 0.5 / np.sqrt(3), rel=0.1)
 
 
 def test_commands_that_only_vary_together_are_warned_of(tmp_path: Path) -> None:
