@@ -388,12 +388,14 @@ def _forecast(known: _Error) -> Forecast:
         for number, size in enumerate(sizes):
             wrong = known.left(sets, np.isin(known.recording, order[:size]), out)
             left[number, refit] = float(np.minimum(1.0, (wrong**2).mean(axis=0) / variance).mean())
+    return _extrapolated(sizes, left, round(1.5 * count))
+
+
+def _extrapolated(sizes: tuple[int, ...], left: Floats, more: int) -> Forecast:
     # To what no number of recordings explains; faster than with 1 / recordings, as that of least squares does.
-    more = round(1.5 * count)
     (before, last), (less, now) = 1 / np.square(sizes[-2:], dtype=float), left[-2:]
     at = np.maximum(0.0, now + (now - less) * (1 / more**2 - last) / (last - before))
-    expected, gain = (_of_refits(values) for values in (at, 1 - at / left[-1]))
-    return Forecast(sizes, left, more, expected, gain)
+    return Forecast(sizes, left, more, _of_refits(at), _of_refits(1 - at / left[-1]))
 
 
 def _of_refits(values: Floats) -> tuple[float, float, float]:

@@ -9,7 +9,7 @@ import pytest
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ACTION, NEXT_STATE, OUTCOME_COLUMNS, STATE, SUCCESS, TERMINATED, Column, Episode
 from astra_data.dataset.writer import DatasetWriter
-from astra_data.grounding.diagnosis import Diagnosis, Forecast, Missed, _of_forecast, diagnose
+from astra_data.grounding.diagnosis import Diagnosis, Forecast, Missed, _extrapolated, _of_forecast, diagnose
 from astra_data.pipeline.stages.pair import pair
 from astra_data.reports.diagnosis import diagnosis_page
 
@@ -105,6 +105,7 @@ def test_a_time_constant_is_a_delay_and_is_hidden_state(tmp_path: Path) -> None:
     assert not any("failure" in line.what or "whole recorded state" in line.what for line in found.findings)
     # Of a lag all is known after a few recordings.
     assert any("these are enough" in line.advice for line in found.findings)
+    assert found.forecast and found.forecast.more == 18 and found.forecast.sizes == (4, 5, 7, 10)
 
 
 def test_a_current_that_lasts_is_hidden_state_and_gusts_are_seen_in_what_is_recorded(tmp_path: Path) -> None:
@@ -117,7 +118,7 @@ def test_a_current_that_lasts_is_hidden_state_and_gusts_are_seen_in_what_is_reco
     present, late, history, whole = gusts.explained.values()
     assert history[0] - present[0] < 0.05 and whole[0] > 0.95
     # y, all of whose error is that of a gain, and x, of which that is a hundredth of the gusts.
-    assert present[0] == pytest.approx(0.5, abs=0.05) and present.shape == (201,)
+    assert present[0] == pytest.approx(0.5, abs=0.05) and present.shape == (201,) and present.min() >= 0
     assert any(
         line.advice == "the simulator may gain from more of it, such as current, in φ" for line in gusts.findings
     )
@@ -149,6 +150,7 @@ def test_a_command_that_the_simulator_ignores_is_named(tmp_path: Path) -> None:
     assert line.severity == "note" and not found.responses[1].weights.any()
     # Where it only rounds, there is no place where it errs more.
     x, y = found.missed
+    assert next(iter(found.explained.values()))[0] > 0.99
     assert x.error < 1e-6 and not x.where and y.error == pytest.approx(0.1 * 0.5 / np.sqrt(3), rel=0.1)
 
 
@@ -178,6 +180,10 @@ def test_a_forecast_says_more_only_where_its_interval_does(
     assert line.advice.startswith(advice)
     assert line.what.startswith(
         f"of the simulator's error, histories leave {now:.2f}, with 15 recordings {expected:.2f} ["
+    )
+    found = _extrapolated((7, 10, 20), np.tile([[0.9], [0.23], [0.2075]], 3), 30)  # 0.2 + 3 / recordings²
+    assert found.expected == pytest.approx([0.2 + 3 / 900] * 3) and found.gain == pytest.approx(
+        [1 - found.expected[0] / 0.2075] * 3
     )
     [line] = _of_forecast(None, [])
     assert line.advice == "record 10 or more"
