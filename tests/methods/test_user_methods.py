@@ -1,5 +1,6 @@
 """Methods of the user's: rows beside those of the package."""
 
+import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -26,6 +27,7 @@ from astra_data.worlds.user_code import user_object
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "recipes/examples/methods"
 ANTS = TASKS["antmaze-umaze"]
+CARTS = user_object(f"{ROOT}/recipes/examples/cart/cart.py:TASK")
 pytestmark = pytest.mark.usefixtures("forgotten_methods")
 SMALL = """
 [collect]
@@ -105,6 +107,45 @@ def test_a_residual_ensemble_finds_by_how_much_the_simulator_is_wrong(tmp_path: 
     state, action = torch.linspace(0.1, 0.9, 9)[:, None], torch.linspace(0.5, -0.5, 9)[:, None]
     expected = 0.3 * state - 0.1 * action
     torch.testing.assert_close(grounding.ensemble(state, action), expected, atol=0.03, rtol=0)
+
+
+@torch.no_grad()
+def late_carts(response: Any, count: int, seed: int) -> Any:
+    """Return drives of 60 steps of the example's unicycle, whose commands act as `response` says."""
+    generator = torch.Generator().manual_seed(seed)
+    action = (2 * torch.rand(count, 20, 2, generator=generator) - 1).repeat_interleave(3, dim=1)
+    simulator = CARTS.simulator(count)
+    states = [simulator.state]
+    states += [simulator.step(felt) for felt in response.sequence(action)[0].unbind(1)]
+    along = torch.stack(states, dim=1)
+    return toy_episodes(along[:, :-1], action, next_state=along[:, 1:])
+
+
+@pytest.mark.parametrize(
+    ("gain", "offset", "share", "delay"),
+    [((0.8, 0.6), (0.05, -0.1), (0.5, 0.35), 2), ((0.9, 0.7), (0.0, 0.1), (1.0, 0.8), 0)],
+)
+def test_fitted_parameters_are_those_that_were_planted(
+    tmp_path: Path, gain: Any, offset: Any, share: Any, delay: int
+) -> None:
+    method = user_object(f"{EXAMPLES / 'parameters.py'}:METHOD")
+    still = CARTS.limits.normal(torch.zeros(2))
+    planted = sys.modules[method.fit.__module__].Response(*map(torch.tensor, (gain, offset, share)), still, delay)
+    training, held_out = late_carts(planted, 20, 0), late_carts(planted, 4, 1)
+    given = Fitting(CARTS, GroundConfig(), method.table.usual, training, held_out, 0, "cpu", tmp_path, silent)
+    grounding, figures = method.fit(given)
+    assert figures["delay"] == delay
+    for name, values in (("gain", gain), ("offset", offset), ("share", share)):
+        assert figures[name] == pytest.approx(values, abs=0.01), name
+    again, windows = type(grounding).from_file(*grounding.to_file(), "cpu"), held_out.windows
+    before = again.hidden_before(windows)
+    simulator = again.simulator(CARTS, 4)
+    # From the middle of an episode, it goes on as the robot did.
+    simulator.start(windows.state[:, 30], torch.arange(4), windows.goal[:, 30], hidden=before[:, 30])
+    for step in range(30, 59):
+        after = simulator.step(windows.action[:, step])
+    torch.testing.assert_close(after, windows.next_state[:, 58], atol=0.03, rtol=0)
+    assert before.shape == (4, 60, 2 * (delay + 1)) and torch.equal(before[:, 0], still.repeat(4, delay + 1))
 
 
 def test_golemos_lstm_learns_a_lag_that_only_a_memory_knows(tmp_path: Path) -> None:
