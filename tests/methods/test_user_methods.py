@@ -98,15 +98,28 @@ def test_a_delta_action_finds_what_was_added_to_the_commands(tmp_path: Path, sim
     torch.testing.assert_close(added, torch.full((8, 20, 1), 0.2), atol=0.07, rtol=0)
 
 
-def test_a_residual_ensemble_finds_by_how_much_the_simulator_is_wrong(tmp_path: Path) -> None:
-    method = user_object(f"{EXAMPLES / 'residual_ensemble.py'}:METHOD")
+def test_each_member_of_an_ensemble_learns_the_correction_and_an_episode_keeps_its_member(tmp_path: Path) -> None:
+    method = user_object(f"{EXAMPLES / 'gru_ensemble.py'}:METHOD")
     given = fitting(tmp_path, moved_by=0.0)
     windows = given.training.windows
     windows.next_state = windows.simulated_next + 0.3 * windows.state - 0.1 * windows.action  # type: ignore[misc]
     grounding, _ = method.fit(given)
-    state, action = torch.linspace(0.1, 0.9, 9)[:, None], torch.linspace(0.5, -0.5, 9)[:, None]
-    expected = 0.3 * state - 0.1 * action
-    torch.testing.assert_close(grounding.ensemble(state, action), expected, atol=0.03, rtol=0)
+    every, _ = grounding.ensemble(windows.state, windows.action, windows.simulated_next, torch.zeros(8, 5 * 64))
+    expected = 0.3 * windows.state - 0.1 * windows.action
+    assert every.shape == (5, 8, 20, 1)
+    torch.testing.assert_close(every[:, :, 2:], expected.expand(5, -1, -1, -1)[:, :, 2:], atol=0.06, rtol=0)
+    simulator = type(grounding).from_file(*grounding.to_file(), "cpu").simulator(TASK, 8)
+    torch.manual_seed(0)
+    simulator.start(windows.state[:, 0], torch.arange(8), torch.zeros(8, 1))
+    member, before = simulator.member.clone(), grounding.hidden_before(windows, every=3)
+    assert len(set(member.tolist())) > 2 and before.shape == (8, 7, 320) and not before[:, 0].any()
+    for step in range(6):
+        simulator.simulator.reset_to(windows.state[:, step])
+        after = simulator.step(windows.action[:, step])
+        corrected = windows.simulated_next[:, step] + every[member, torch.arange(8), step]
+        torch.testing.assert_close(after, corrected, atol=1e-5, rtol=0)
+    assert torch.equal(simulator.member, member)
+    torch.testing.assert_close(simulator.hidden, before[:, 2], atol=1e-5, rtol=0)
 
 
 @torch.no_grad()
@@ -225,7 +238,7 @@ def test_they_are_rows_from_the_recipe_to_the_page(tmp_path: Path) -> None:
             "own.toml: own_methods: delta_action: memroy: unknown key: did you mean 'memory'",
         ),
         ("delta_action", "memory = 0", "memory: expected greater than or equal to 1, got 0"),
-        ("residual_ensemble", "members = 3", "residual_ensemble.py:METHOD has no settings, got members"),
+        ("gru_ensemble", "members = 3", "gru_ensemble.py:METHOD has no settings, got members"),
     ],
 )
 def test_settings_that_it_has_not_are_refused(tmp_path: Path, method: str, given: str, told: str) -> None:
@@ -237,7 +250,7 @@ def test_settings_that_it_has_not_are_refused(tmp_path: Path, method: str, given
 def test_one_name_is_not_two_methods(tmp_path: Path) -> None:
     add_method("mine", DELTA)
     add_method("mine", DELTA)
-    other = f"{EXAMPLES}/residual_ensemble.py:METHOD"
+    other = f"{EXAMPLES}/gru_ensemble.py:METHOD"
     with pytest.raises(BadInputError, match=f"method 'mine' is {DELTA} already: give {other} another name"):
         add_method("mine", other)
     assert METHODS["mine"].title == "Delta action"

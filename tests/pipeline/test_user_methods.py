@@ -14,7 +14,7 @@ from astra_data.reports.results import results_json
 
 EXAMPLES = Path(__file__).parents[2] / "recipes/examples/methods"
 pytestmark = pytest.mark.usefixtures("forgotten_methods")
-DELTA, ENSEMBLE = (f"{EXAMPLES}/{name}.py:METHOD" for name in ("delta_action", "residual_ensemble"))
+DELTA, ENSEMBLE = (f"{EXAMPLES}/{name}.py:METHOD" for name in ("delta_action", "gru_ensemble"))
 
 
 def test_a_place_alone_is_a_method_with_its_usual_settings() -> None:
