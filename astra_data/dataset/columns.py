@@ -279,6 +279,17 @@ def new_uid(uid: int, origin: bytes, known: Collection[int]) -> int:
     return uid
 
 
+def distinct_uids(found: Iterable[tuple[int, bytes]]) -> list[int]:
+    """Return the uids of episodes found with uid and origin; those that an earlier one has are new ones."""
+    found = list(found)
+    known, taken, names = {uid for uid, _ in found}, set[int](), list[int]()
+    for uid, origin in found:
+        names.append(new_uid(uid, origin, known) if uid in taken else uid)
+        known.add(names[-1])
+        taken.add(names[-1])
+    return names
+
+
 def renamed_metadata(uid: int, metadata: Mapping[str, Scalar], names: Mapping[int, int]) -> dict[str, Any]:
     """Return the metadata of the episode `uid` whose data's uids are replaced by `names`: old to new."""
     renamed = dict(metadata)

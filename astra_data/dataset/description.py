@@ -124,6 +124,7 @@ def read_description(root: Path) -> dict[str, Any]:
     return found
 
 
+digest_of = xxh3_64_intdigest  # of contiguous values (T,) or (T, size) of one episode
 Digests = Mapping[str, NDArray[np.uint64]]  # column to the digest of each episode, (E,)
 SEALED = (
     layout.INFO_PATH,
@@ -133,11 +134,6 @@ SEALED = (
     layout.SUBSETS_PATH,
     layout.DIGESTS_PATH,
 )  # the files with a sum, beside the description and those of meta/episodes
-
-
-def digest_of(values: Array) -> int:
-    """Return the digest of contiguous `values` (T,) or (T, size) of one episode."""
-    return xxh3_64_intdigest(values)
 
 
 def altered_columns(columns: Mapping[str, Array], episode: int, digests: Digests) -> list[str]:

@@ -11,7 +11,7 @@ import numpy as np
 from astra_data.core.config import did_you_mean, only_given
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import first_few
-from astra_data.dataset.columns import Scalar, new_uid, renamed_metadata
+from astra_data.dataset.columns import Scalar, distinct_uids, renamed_metadata
 from astra_data.dataset.compare import schema_differences, world_differences
 from astra_data.dataset.description import permutation
 from astra_data.dataset.reader import Dataset
@@ -211,15 +211,9 @@ def _stratified(source: Dataset, key: str, seed: int) -> tuple[list[int], dict[s
 
 def _merged_uids(sources: Sequence[Dataset], new_uids: bool) -> list[dict[int, int]]:
     """Return, for each of `sources`, its episodes' new uids by their old ones."""
-    known, taken = {uid for source in sources for uid in source.uids.tolist()}, set[int]()
-    names: list[dict[int, int]] = []
-    for source in sources:
-        origin, named = f"{source.content_hash} ".encode(), dict[int, int]()
-        for uid in source.uids.tolist():
-            named[uid] = new_uid(uid, origin, known) if uid in taken else uid
-            known.add(named[uid])
-            taken.add(named[uid])
-        names.append(named)
+    found = [(uid, f"{source.content_hash} ".encode()) for source in sources for uid in source.uids.tolist()]
+    given = iter(distinct_uids(found))
+    names = [{uid: next(given) for uid in source.uids.tolist()} for source in sources]
     repeated = sorted(uid for named in names for uid, name in named.items() if uid != name)
     if repeated and not new_uids:
         which = f"{len(repeated)} episodes have the uid of an earlier one ({first_few(repeated, MOST_UIDS)})"

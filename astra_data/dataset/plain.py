@@ -181,9 +181,7 @@ def read_tasks(root: Path) -> dict[int, str] | str:
     if isinstance(table, str):
         return table
     numbers = [field.name for field in table.schema if pa.types.is_integer(field.type)]
-    texts = [
-        field.name for field in table.schema if pa.types.is_string(field.type) or pa.types.is_large_string(field.type)
-    ]
+    texts = [field.name for field in table.schema if field.type in (pa.string(), pa.large_string())]
     if (table.num_columns, numbers, len(texts)) != (2, [names.TASK_INDEX], 1):
         found = ", ".join(f"{field.name} ({field.type})" for field in table.schema)
         return f"has the columns {found}, expected {names.TASK_INDEX} and one of texts"

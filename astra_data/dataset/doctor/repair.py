@@ -14,7 +14,7 @@ from astra_data.dataset import columns as names
 from astra_data.dataset import format as layout
 from astra_data.dataset import lerobot_recording as lerobot
 from astra_data.dataset.cameras import Camera, clip_fault, read_cameras
-from astra_data.dataset.columns import Array, Column, Episode, Scalar, new_uid, renamed_metadata
+from astra_data.dataset.columns import Array, Column, Episode, Scalar, distinct_uids, renamed_metadata
 from astra_data.dataset.description import Digests, altered_files, read_description, read_digests
 from astra_data.dataset.doctor.salvage import whole_runs
 from astra_data.dataset.plain import PlainColumn, Run, is_format_2, read_object, read_small_table, read_tasks
@@ -184,15 +184,10 @@ def join(
         for episode in source.episodes([column.name for column in shared]):
             known.setdefault((episode.uid, _digest(episode.columns, shared)), (number, episode.metadata))
     found = [(uid, _digest(values, shared)) for uid, values in episodes]
-    reserved, taken, renames = {uid for uid, _ in found}, set[int](), list[int]()
+    renames = distinct_uids(found)
     renamed: dict[int | None, dict[int, int]] = {}
-    for key in found:
-        uid, digest = key
-        name = new_uid(uid, digest, reserved) if uid in taken else uid
-        reserved.add(name)
-        taken.add(name)
-        renames.append(name)
-        renamed.setdefault(known.get(key, (None, {}))[0], {})[uid] = name
+    for key, name in zip(found, renames, strict=True):
+        renamed.setdefault(known.get(key, (None, {}))[0], {})[key[0]] = name
     joined = []
     for key, name in zip(found, renames, strict=True):
         origin, facts = known.get(key, (None, {}))

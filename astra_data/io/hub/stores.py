@@ -45,13 +45,8 @@ _VERSION = re.compile(rf"[@/](data-)?(?P<version>{VERSION.pattern})/?$")
 
 def dataset_files(root: Path) -> list[str]:
     """List the files that belong to the dataset in folder `root`, relative to it, and no others."""
-    places = (
-        "data/*/*",
-        "videos/*/*/*",
-        "meta/*",
-        "meta/astra/*",
-        "meta/episodes/*/*",
-    )  # globs follow links, ** would not
+    # Such globs follow links, ** would not.
+    places = ("data/*/*", "videos/*/*/*", "meta/*", "meta/astra/*", "meta/episodes/*/*")
     paths = [path.relative_to(root).as_posix() for place in places for path in root.glob(place) if path.is_file()]
     return sorted(path for path in paths if _PATH.fullmatch(path))
 
