@@ -11,10 +11,7 @@ from astra_data.core.naming import PLUS, base_method, is_plus
 from astra_data.grounding.encoder import ENCODERS
 from astra_data.grounding.files import KINDS, missing_parts
 from astra_data.grounding.fit import HistoryFit
-from astra_data.methods.astra import ABLATIONS, ASTRA, NAS
-from astra_data.methods.baselines import COMPASS, DIRECT_TRANSFER, DOMAIN_RANDOMIZATION, FULL_OBS, TARGET
-from astra_data.methods.follower import FOLLOWER
-from astra_data.methods.iql import BEHAVIOR_CLONING, DIRECT_TRANSFER_IQL, IQL
+from astra_data.methods import astra, follower, iql
 from astra_data.methods.method import Method, Table
 from astra_data.methods.rma import RMA
 from astra_data.policies.running_policy import add_policy_kind
@@ -25,19 +22,19 @@ from astra_data.worlds.variation import Variation
 METHODS: dict[str, Method] = {
     method.name: method
     for method in (
-        DIRECT_TRANSFER,
-        DOMAIN_RANDOMIZATION,
-        NAS,
+        astra.DIRECT_TRANSFER,
+        astra.DOMAIN_RANDOMIZATION,
+        astra.NAS,
         RMA,
-        TARGET,
-        FULL_OBS,
-        COMPASS,
-        IQL,
-        BEHAVIOR_CLONING,
-        DIRECT_TRANSFER_IQL,
-        ASTRA,
-        *ABLATIONS,
-        FOLLOWER,
+        astra.TARGET,
+        astra.FULL_OBS,
+        astra.COMPASS,
+        iql.IQL,
+        iql.BEHAVIOR_CLONING,
+        iql.DIRECT_TRANSFER_IQL,
+        astra.ASTRA,
+        *astra.ABLATIONS,
+        follower.FOLLOWER,
     )
 }  # by name. Recipes list the methods' tables, and results the settings in them, in this order.
 

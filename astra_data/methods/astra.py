@@ -1,11 +1,11 @@
-"""ASTRA: grounding by self-prediction, the predicted reward, an aligned target encoder (Section IV)."""
+"""ASTRA: grounding by self-prediction, the predicted reward, an aligned target encoder (Section IV); its baselines."""
 
 from dataclasses import replace
 from typing import Any
 
 from astra_data.grounding.fit import HistoryFit
-from astra_data.methods.method import Method
-from astra_data.policies.train import InSimulator
+from astra_data.methods.method import Method, Table
+from astra_data.policies.train import InSimulator, InTarget, TargetConfig
 
 _FIT = HistoryFit(latent=True, reward=True)
 ASTRA = Method(
@@ -38,3 +38,19 @@ ABLATIONS = (
 )
 
 NAS = Method(name="nas", title="NAS", color="#56B4E9", fit=replace(_FIT, latent=False, reward=False))
+# A recurrent policy trained in the raw simulator and deployed unchanged.
+DIRECT_TRANSFER = Method(name="direct_transfer", title="Direct transfer", color="#E69F00", role="floor")
+DOMAIN_RANDOMIZATION = Method(
+    name="domain_randomization", title="Domain randomization", color="#CC79A7", learn=InSimulator(ranges="randomized")
+)
+COMPASS = Method(name="compass", title="COMPASS", color="#B8A000", learn=InSimulator(ranges="wide"))
+TARGET = Method(
+    name="target",
+    title="Target",
+    color="#4D4D4D",
+    role="trained there",
+    learn=InTarget("abstract"),
+    learns_from="target",
+    table=Table("target", TargetConfig),
+)
+FULL_OBS = replace(TARGET, name="full_obs", title="Full Obs", color="#1A1A1A", learn=InTarget("full"))

@@ -2,7 +2,7 @@
 
 import pytest
 
-from astra_data.methods.baselines import COMPASS, DOMAIN_RANDOMIZATION
+from astra_data.methods.astra import COMPASS, DOMAIN_RANDOMIZATION
 from astra_data.methods.rma import RMA
 from astra_data.policies.train import InSimulator
 from astra_data.robots.registry import TASKS

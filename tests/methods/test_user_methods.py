@@ -277,7 +277,7 @@ def test_what_is_no_method_is_refused_in_one_line(tmp_path: Path, name: str, pla
 HEAD = """
 from pydantic import BaseModel
 from astra_data.core.config import Config
-from astra_data.methods.baselines import DIRECT_TRANSFER
+from astra_data.methods.astra import DIRECT_TRANSFER
 from astra_data.methods.method import Method, Table
 from astra_data.grounding.simulator import FittedGrounding
 class Ours(Config):
