@@ -166,10 +166,8 @@ def first_simulator(logs: Logs) -> SimulatorKind:
         good, (simulated, still) = kinds[best], errors[best]
         along = {name for name, way in good.driven.items() if way != "turn"}
         if "left" in good.driven.values() and along <= direct.driven.keys():
-            moved, place = (
-                dict(zip(direct.names, direct.errors()[0], strict=True)),
-                [e.code[0] for e in good.entries[:2]],
-            )
+            moved = dict(zip(direct.names, direct.errors()[0], strict=True))
+            place = [entry.code[0] for entry in good.entries[:2]]
             along_axes = sum(moved[name] for name in place) if {*place} <= moved.keys() else still[0]
             good = good if simulated[0] < along_axes else None  # two arms, or a base that is driven along x and y
     if not good:
