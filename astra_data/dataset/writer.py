@@ -156,7 +156,11 @@ class DatasetWriter:
         for name, clip in episode.cameras.items() if self._cameras else ():
             pictures |= {f"stats/{name}/{key}": value for key, value in clip.statistics.items()}
             if name in self._clips:
-                span = self._clips[name].add(clip)
+                try:
+                    span = self._clips[name].add(clip)
+                except CorruptDatasetError as error:
+                    advice = "`astra-data repair DATASET --out FOLDER` keeps the other episodes"
+                    raise CorruptDatasetError(f"{error}: {advice}") from None
                 place = (*divmod(span.file, layout.CHUNK_SIZE), span.from_s, span.to_s)
                 pictures |= {f"videos/{name}/{key}": x for key, x in zip(layout.VIDEO_PLACE, place, strict=True)}
         values = {name: episode.columns[name] for name in self._columns} | layout.reserved_values(

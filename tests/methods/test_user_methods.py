@@ -208,10 +208,13 @@ def test_causal_compass_finds_the_parameters_that_were_planted(tmp_path: Path) -
     assert grounding.variation.position_noise_m == (0.0, 2e-3)  # noise is not identified
 
 
+NAMED = ("delta_action", "nas_golemo", "sb3_ppo", "parameters", "gru_ensemble")
+
+
 @pytest.mark.usefixtures("quick_fits")
 def test_they_are_rows_from_the_recipe_to_the_page(tmp_path: Path) -> None:
-    own = "".join(f'{name} = "{EXAMPLES}/{name}.py:METHOD"\n' for name in ("delta_action", "nas_golemo", "sb3_ppo"))
-    rows = '["direct_transfer", "delta_action", "nas_golemo", "sb3_ppo"]'
+    own = "".join(f'{name} = "{EXAMPLES}/{name}.py:METHOD"\n' for name in NAMED)
+    rows = str(["direct_transfer", *NAMED])
     path = recipe(tmp_path, rows, own)
     experiment = load_experiment(path, tmp_path / "runs")
     for item in plan(experiment.recipe, path, experiment.folder):
@@ -220,7 +223,7 @@ def test_they_are_rows_from_the_recipe_to_the_page(tmp_path: Path) -> None:
     fitted = load_grounding(experiment.folder / "ground/delta_action/seed_0/grounding.safetensors")
     assert fitted.kind == "delta action"
     page = (experiment.folder / "report/results.md").read_text()
-    for row in ("Delta action", "NAS (Golemo et al.)", "NAS, PPO of SB3"):
+    for row in ("Delta action", "NAS (Golemo et al.)", "NAS, PPO of SB3", "Fitted parameters", "GRU ensemble"):
         assert f"| {row} |" in page
     assert not (experiment.folder / "ground/sb3_ppo").exists()  # it is trained in NAS's simulator
     METHODS.pop("delta_action"), registry._PLACES.pop("delta_action")

@@ -93,7 +93,7 @@ class FittedParameters(FittedGrounding):
 
     @classmethod
     def from_file(cls, tensors, metadata, device):
-        return cls(Response(**{name: values.to(device) for name, values in tensors.items()}, **metadata))
+        return cls(Response(**{name: values.to(device) for name, values in tensors.items()}, delay=metadata["delay"]))
 
 
 @torch.no_grad()
