@@ -6,10 +6,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ACTION, NEXT_STATE, OUTCOME_COLUMNS, STATE, SUCCESS, TERMINATED, Column, Episode
 from astra_data.dataset.writer import DatasetWriter
-from astra_data.grounding.diagnosis import Diagnosis, Forecast, Missed, _extrapolated, _of_forecast, diagnose
+from astra_data.grounding.diagnosis import (
+    Diagnosis,
+    Forecast,
+    Missed,
+    _extrapolated,
+    _of_forecast,
+    _of_hidden_state,
+    diagnose,
+)
 from astra_data.pipeline.stages.pair import pair
 from astra_data.reports.diagnosis import diagnosis_page
 
@@ -201,3 +210,22 @@ def test_a_dataset_that_is_not_paired_is_refused(tmp_path: Path) -> None:
     recorded(tmp_path)
     with pytest.raises(BadInputError, match=r"no column abstract.state: expected a dataset that was paired"):
         diagnose(tmp_path / "logs", f"{tmp_path / 'axes.py'}:Axes")
+
+
+def test_what_explains_more_is_told_only_where_its_interval_does() -> None:
+    def of(value: float, low: float, high: float) -> Floats:
+        return np.array([value, *np.linspace(low, high, 200)])
+
+    present, late, sure, unsure, whole = (
+        of(0.3, 0.3, 0.3),
+        of(0.3, 0.3, 0.3),
+        of(0.6, 0.5, 0.7),
+        of(0.6, 0.2, 0.7),
+        0.62,
+    )
+    told = [line.advice for line in _of_hidden_state([present, late, sure, of(whole, 0.6, 0.7)], ["current"])]
+    assert told == ["there is state that neither the abstract state nor commands show: train `astra_plus`"]
+    told = [line.advice for line in _of_hidden_state([present, late, unsure, of(whole, 0.6, 0.7)], [])]
+    assert told == ["for the motion nothing hidden shows: `nas`, or a parameter of the simulator, may do"]
+    told = [line.advice for line in _of_hidden_state([present, late, late, of(whole, 0.6, 0.7)], [])]
+    assert told[-1] == "the simulator may gain from more of it in φ"
