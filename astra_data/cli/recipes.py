@@ -1,8 +1,9 @@
 """Commands on recipes and runs, of stages alone, and what to begin with."""
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -10,6 +11,9 @@ from astra_data.cli import arguments
 from astra_data.cli.arguments import show_table
 from astra_data.core.errors import AstraDataError, BadInputError
 from astra_data.core.naming import RUNS, artifact_key
+
+if TYPE_CHECKING:
+    from astra_data.reports.choice import TrialsFile
 
 
 def run(
@@ -208,6 +212,9 @@ def select(
     trials: Annotated[
         int | None, typer.Option(help="Make the final choice with so many episodes in the target.", min=1)
     ] = None,
+    by_hand: Annotated[
+        bool, typer.Option("--by-hand", help="With --trials: at the robot, by a person who gives each result.")
+    ] = False,
     field: Annotated[
         int | None, typer.Option(help="With --trials: number of candidates to try.", show_default="as many as possible")
     ] = None,
@@ -215,27 +222,45 @@ def select(
 ) -> None:
     """Rank the trained policies of a run without the target, or with a few trials in it."""
     arguments.run_at(run)
-    if trials is None and (field is not None or percent is not None):
-        raise BadInputError("--field and --percent need --trials: add --trials, or leave them out")
+    if trials is None and (by_hand or field is not None or percent is not None):
+        raise BadInputError("--by-hand, --field and --percent need --trials: add --trials, or leave them out")
     from astra_data.pipeline.display import shown
     from astra_data.pipeline.selecting import choose_by_trials
     from astra_data.pipeline.selecting import select as rank
     from astra_data.reports.choice import FOLDER
 
+    given: dict[str, Any] = {"rows": row or (), "judge": judge, "episodes": episodes}
     with shown("select") as progress:
-        given: dict[str, Any] = {"rows": row or (), "judge": judge, "episodes": episodes, "progress": progress}
-        if trials is not None:
-            made = choose_by_trials(run, trials, field=field, percent=percent, **given)
-            assert made.chosen is not None
-            best, seed = made.chosen
-            lines = [f"chosen with {made.spent} trials: {best}, seed {seed}: success {made.mean:.2f}"]
+        given["progress"] = progress
+        if trials is not None and not by_hand:
+            lines = [_chosen(choose_by_trials(run, trials, field=field, percent=percent, **given))]
         else:
             judged, lines = rank(run, **given), []
             for percent in judged.percents:
                 first, size = judged.ranked(percent)[0], f" at {percent} %" if percent else ""
                 reached = f"{first.lower:.2f} in the lower quartile of its judges"
                 lines.append(f"chosen{size}: {first.row}, seed {first.seed}: {reached}")
+    if trials is not None and by_hand:
+        given["progress"] = lambda _, note: typer.echo(note, err=True)
+        lines = [_chosen(choose_by_trials(run, trials, by_hand=_key, field=field, percent=percent, **given))]
     typer.echo("\n".join([*lines, f"written: {run / FOLDER / 'select.md'}"]))
+
+
+def _chosen(made: "TrialsFile") -> str:
+    if made.chosen is None or made.rate is None:
+        return f"{made.spent} trials are made: fill in trials.csv beside the page, and run the same command again"
+    from astra_data.reports.statistics import Estimate, interval
+
+    row, seed = made.chosen
+    return f"chosen with {made.spent} trials: {row}, seed {seed}: success {interval(Estimate(*made.rate))}"
+
+
+def _key(what: str) -> str:
+    typer.echo(what)
+    if not sys.stdin.isatty():
+        return "q"
+    typer.echo("s: success, f: failure, v: void, q: quit", err=True)
+    return typer.getchar().lower()
 
 
 def deploy(

@@ -15,6 +15,8 @@ from astra_data.core.errors import BadInputError
 CHECKPOINT = "checkpoint.safetensors"  # name, or the end of it, of the file that a training goes on from
 _SETTINGS = "config.json"  # name of the file of the settings in a folder
 MANIFEST = "manifest.json"
+SHEET = "trials.csv"
+"""Name of the file that a person fills in, so no manifest has it."""
 
 
 def refuse_finished(out: Path) -> None:
@@ -147,6 +149,6 @@ def read_manifest(folder: Path) -> Manifest | None:
 
 
 def _files(folder: Path) -> dict[str, Path]:
-    """Return the files in `folder`, by their paths inside it, without its manifest."""
+    """Return the files in `folder`, by their paths inside it, without its manifest and sheet."""
     files = {path.relative_to(folder).as_posix(): path for path in sorted(folder.rglob("*"))}
-    return {name: path for name, path in files.items() if path.is_file() and name != MANIFEST}
+    return {name: path for name, path in files.items() if path.is_file() and name not in (MANIFEST, SHEET)}

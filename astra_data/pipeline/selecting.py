@@ -5,16 +5,22 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from shutil import copy2
+from typing import Any
 
-from astra_data.core.artifact import finished_folder, read_manifest
+import numpy as np
+import torch
+from torch import Tensor
+
+from astra_data.core.artifact import SHEET, finished_folder, read_manifest
 from astra_data.core.config import only_given, validated
 from astra_data.core.durable import alone_in
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, part, silent
 from astra_data.core.seeding import derive
+from astra_data.pipeline.by_hand import Ask, Sheet
 from astra_data.pipeline.run import set_aside
 from astra_data.pipeline.stages.evaluate import EvaluateConfig
-from astra_data.pipeline.stages.select import SelectConfig, benches, digests, judge_in
+from astra_data.pipeline.stages.select import SelectConfig, benches, digests, judge_in, predicted_from
 from astra_data.pipeline.stages.select import select as judge_all
 from astra_data.pipeline.trained_policy import settings_of, trained_policy
 from astra_data.pipeline.user_code import add_all
@@ -35,6 +41,18 @@ def select(
     progress: Progress = silent,
 ) -> choice.Judged:
     """Judge every trained policy of a run, as the stage `select` does; a choice made of the same is kept."""
+    folder, (recipe, config) = Path(run), _asked(run, rows, judge, episodes)
+    with alone_in(folder):
+        if not _is_current(folder, recipe, config) or choice.read_judged(folder) is None:
+            judge_all(recipe, config, root=folder, progress=progress)
+        judged = choice.read_judged(folder)
+    assert judged is not None
+    return judged
+
+
+def _asked(
+    run: str | Path, rows: Sequence[str], judge: str | None, episodes: int | None
+) -> tuple[Reported, SelectConfig]:
     folder, settings = Path(run), settings_of(run)
     add_all(settings.get("own_methods", {}))
     asked = (settings.get("select") or {}) | only_given(judge=judge, episodes=episodes)
@@ -47,12 +65,7 @@ def select(
         settings=settings,
         percents=tuple(settings.get("sweep", {}).get("percent", ())),
     )
-    with alone_in(folder):
-        if not _is_current(folder, recipe, config) or choice.read_judged(folder) is None:
-            judge_all(recipe, config, root=folder, progress=progress)
-        judged = choice.read_judged(folder)
-    assert judged is not None
-    return judged
+    return recipe, config
 
 
 def _is_current(folder: Path, recipe: Reported, config: SelectConfig) -> bool:
@@ -77,6 +90,7 @@ def choose_by_trials(
     run: str | Path,
     trials: int,
     *,
+    by_hand: Ask | None = None,
     field: int | None = None,
     percent: int | None = None,
     rows: Sequence[str] = (),
@@ -84,10 +98,16 @@ def choose_by_trials(
     episodes: int | None = None,
     progress: Progress = silent,
 ) -> choice.TrialsFile:
-    """Spend so many episodes in the target on the candidates of a run, `field` at most; write `select/trials.json`."""
-    folder, task = Path(run), str(settings_of(run)["task"])
-    if not task_named(task).has_target:
-        raise BadInputError(f"{folder}: expected a task with a target, got {task}: leave out --trials")
+    """Spend so many episodes in the target on the candidates of a run, `field` at most; write `select/trials.json`.
+
+    With `by_hand` a person makes them at the robot; what is returned has no `chosen` while any are still to be made.
+    """
+    folder, task = Path(run), task_named(str(settings_of(run)["task"]))
+    if by_hand is None and not task.has_target:
+        raise BadInputError(
+            f"{folder}: expected a task with a target, got {settings_of(run)['task']}: leave out --trials, or make "
+            "them at the robot, with --by-hand"
+        )
     least = choice.least_trials(max(2, field or 2))
     if (field is not None and field < 2) or trials < least:
         raise BadInputError(
@@ -104,9 +124,10 @@ def choose_by_trials(
         raise BadInputError(f"expected two candidates or more to try, {of}: give another --field, or more rows")
     field = field or choice.widest_field(len(candidates), trials)
     begun = choice.TrialsFile(trials=trials, field=field, percent=percent, pseudo_trials=choice.PSEUDO_TRIALS)
+    begun = begun.model_copy(update={"by_hand": by_hand is not None})
     path = folder / choice.FOLDER / choice.TRIALS
     if there := choice.read_trials(path):
-        for name, now in begun.model_dump(include={"trials", "field", "percent", "pseudo_trials"}).items():
+        for name, now in begun.model_dump(include={"trials", "field", "percent", "by_hand", "pseudo_trials"}).items():
             if (was := getattr(there, name)) != now:
                 raise BadInputError(
                     f"{path}: expected trials with {name} = {now}, found {there.spent} made with {was}: "
@@ -114,11 +135,47 @@ def choose_by_trials(
                 )
     begun, shown = there or begun, part(progress, 0.5, 1.0)
     rounds = list(begun.rounds)  # of which nothing is tried again
+    sheet = Sheet(path.parent / SHEET, task)
+
+    def planned(number: int) -> list[Tensor]:
+        rng, one = np.random.default_rng(derive(number, "trials by hand")), rounds[number]
+        starts = task.objective.draw_starts(rng, one.trials), task.objective.draw_goals(rng, one.trials)
+        sheet.plan(number, one.candidates, *starts)
+        return [torch.from_numpy(values) for values in starts]
+
+    def at_robot(number: int, those: tuple[int, ...], ask: Ask) -> None:
+        if not rounds[number].predicted:
+            (recipe, config), starts, predicted = _asked(run, rows, judge, episodes), planned(number), []
+            for one in those:
+                shown(0.0, f"predicts {candidates[one].name} from the starts of round {number + 1}")
+                predicted.append(predicted_from(recipe, config, candidates[one], *starts, root=folder))
+            rounds[number] = rounds[number].model_copy(update={"predicted": predicted})
+            _write(folder, judged, begun.model_copy(update={"rounds": rounds}))
+
+        def state() -> str:
+            tried = []
+            for (row, seed), predicted in zip(rounds[number].candidates, rounds[number].predicted, strict=True):
+                success, of = sheet.counted(number, (row, seed), predicted)
+                tried.append(choice.Tried(row=row, seed=seed, success=success, predicted=of))
+            rounds[number] = rounds[number].model_copy(update={"tried": tried})
+            return choice.advice(judged, begun.model_copy(update={"rounds": rounds}))
+
+        is_filled = sheet.fill(number, ask, state)
+        state()
+        if not is_filled:
+            raise _LeftForLaterError
 
     def attempt(number: int, those: tuple[int, ...], each: int) -> list[int]:
         named = [(candidates[one].row, candidates[one].seed) for one in those]
         if number == len(rounds):
             rounds.append(choice.TrialRound(trials=each, candidates=named))
+        if {*rounds[number].candidates} != {*named}:
+            raise BadInputError(
+                f"{sheet.path}: expected the results that round {number + 1} was planned for, found others in an "
+                f"earlier round: restore them, or move {path.parent} away to begin anew"
+            )
+        if by_hand is not None:
+            at_robot(number, those, by_hand)
         for row, seed in named[len(rounds[number].tried) :]:
             trained = trained_policy(folder, row, seed=seed, percent=begun.percent)
             scale = EvaluateConfig.model_validate(trained.settings.get("evaluate") or {}).leg_scale
@@ -131,14 +188,29 @@ def choose_by_trials(
             now = begun.model_copy(update={"rounds": rounds})
             _write(folder, judged, now)
             shown(now.spent / begun.trials, f"{row}, seed {seed}: {sum(success)} of {each}")
-        return [sum(one.success) for one in rounds[number].tried]
+        counts = {(one.row, one.seed): sum(one.success) for one in rounds[number].tried}
+        return [counts[key] for key in named]
 
     with alone_in(folder):
-        found = choice.halve([one.lower for one in candidates], begun.trials, attempt, field=begun.field)
-        first = candidates[found.chosen]
-        done = begun.model_copy(update={"rounds": rounds, "chosen": (first.row, first.seed), "mean": found.mean})
+        for number in range(len(rounds) if by_hand else 0):
+            planned(number)
+        if sheet.results and (begun.spent or sheet.path.is_file()):
+            sheet.read()
+        try:
+            found = choice.halve([one.lower for one in candidates], begun.trials, attempt, field=begun.field)
+            first = candidates[found.chosen]
+            rate = choice.standings(judged, percent, rounds)[first.row, first.seed].rate
+            end = {"chosen": (first.row, first.seed), "mean": found.mean, "rate": (rate.value, rate.low, rate.high)}
+        except _LeftForLaterError:
+            end = dict[str, Any]()
+        done = begun.model_copy(update={"rounds": rounds} | end)
         _write(folder, judged, done)
+    shown(1.0, choice.advice(judged, done))
     return done
+
+
+class _LeftForLaterError(Exception):
+    """Trials by hand are still to be made."""
 
 
 def _write(folder: Path, judged: choice.Judged, trials: choice.TrialsFile) -> None:
@@ -147,7 +219,8 @@ def _write(folder: Path, judged: choice.Judged, trials: choice.TrialsFile) -> No
     manifest = read_manifest(out)
     assert manifest is not None
     with finished_folder(out, replace=True, made_from=manifest.made_from) as partly:
-        for name in ("config.json", choice.SELECTED):
-            copy2(out / name, partly / name)
+        for name in ("config.json", choice.SELECTED, SHEET):
+            if (out / name).is_file():
+                copy2(out / name, partly / name)
         (partly / choice.TRIALS).write_text(trials.model_dump_json(indent=1))
         (partly / "select.md").write_text(choice.select_page(folder.name, judged, trials))

@@ -123,11 +123,20 @@ def started(policy: RunningPolicy, act: Act, goal: Tensor) -> Act:
 
 @torch.no_grad()
 def in_simulator(
-    world: SimulatorEnv, begin: Begin, horizon: int, seed: int, asked: RecordedRange | None = None
+    world: SimulatorEnv,
+    begin: Begin,
+    horizon: int,
+    seed: int,
+    asked: RecordedRange | None = None,
+    *,
+    starts: tuple[Tensor, Tensor] | None = None,
 ) -> tuple[Outcome, dict[str, Tensor]]:
-    """Run an episode in each row of `world`; return outcomes, and starts and goals, which are the seed's."""
+    """Run an episode in each row of `world`, from `starts` (B, X) with goals (B, G) or the seed's; return both, too."""
     torch.manual_seed(seed)
-    world.reset()
+    if starts is None:
+        world.reset()
+    else:
+        world.start_from(*starts)
     act = begin(world.goal)
     record = EpisodeRecord(world.objective.places(world.simulator.state))
     start_goal = {"start": world.objective.places(world.simulator.state).clone(), "goal": world.goal.clone()}
@@ -254,9 +263,29 @@ def in_target(
 
 def judged_success(task: Task, judge: Grounding, policy: RunningPolicy, episodes: int, seed: int) -> float:
     """Return the share of episodes that succeed in the simulator of a `judge`, whose failure model ends episodes."""
+    return fmean(_judged(task, judge, policy, episodes, seed))
+
+
+_REPEATS = 10  # episodes from a start with each judge
+
+
+def judged_from(task: Task, judge: Grounding, policy: RunningPolicy, state: Tensor, goal: Tensor, seed: int) -> Tensor:
+    """Return the share (N,) of episodes that succeed with a `judge` from each of N states (N, X) with goals (N, G)."""
+    starts = state.float().repeat(_REPEATS, 1), goal.float().repeat(_REPEATS, 1)
+    return torch.tensor(_judged(task, judge, policy, len(starts[0]), seed, starts)).view(_REPEATS, -1).mean(0)
+
+
+def _judged(
+    task: Task,
+    judge: Grounding,
+    policy: RunningPolicy,
+    episodes: int,
+    seed: int,
+    starts: tuple[Tensor, Tensor] | None = None,
+) -> list[float]:
     world = SimulatorEnv(task.objective, judge.simulator(task, episodes), draws_failures=True)
-    outcome, _ = in_simulator(world, partial(started, policy, policy.act_in_simulator), task.objective.horizon, seed)
-    return fmean(outcome.success)
+    begin = partial(started, policy, policy.act_in_simulator)
+    return in_simulator(world, begin, task.objective.horizon, seed, starts=starts)[0].success
 
 
 _EPISODES = 100

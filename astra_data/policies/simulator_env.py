@@ -98,10 +98,16 @@ class SimulatorEnv:
 
     def _start_task(self, rows: Tensor) -> None:
         rng = np.random.default_rng(int(torch.randint(2**62, ())))
-        state = self.objective.draw_starts(rng, len(rows))
-        self.goal[rows] = self._tensor(self.objective.draw_goals(rng, len(rows)))
-        self._command[rows] = 0.0
-        self.simulator.start(self._tensor(state), rows, self.goal[rows])
+        state = self._tensor(self.objective.draw_starts(rng, len(rows)))
+        self._start(state, self._tensor(self.objective.draw_goals(rng, len(rows))), rows)
+
+    def start_from(self, state: Tensor, goal: Tensor) -> None:
+        """Start an episode in each row, from states (B, X) with goals (B, G)."""
+        self._start(state, goal, torch.arange(self.num_envs, device=self.device))
+
+    def _start(self, state: Tensor, goal: Tensor, rows: Tensor) -> None:
+        self.goal[rows], self._command[rows] = goal, 0.0
+        self.simulator.start(state, rows, goal)
 
     def _start_from_data(self, rows: Tensor, starts: DataStarts) -> None:
         moments = torch.randint(len(starts.state), (len(rows),), device=self.device)

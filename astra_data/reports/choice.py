@@ -12,7 +12,7 @@ from pydantic import Field
 from astra_data.methods import method_title
 from astra_data.reports.artifacts import Artifact, WrittenPart, read_json
 from astra_data.reports.blocks import Section, TableBlock, Text, markdown
-from astra_data.reports.statistics import LEAST_SEEDS, Estimate, interval, summarize
+from astra_data.reports.statistics import LEAST_SEEDS, Estimate, interval, success_rate, summarize
 
 FOLDER, SELECTED, TRIALS = "select", "select.json", "trials.json"
 PSEUDO_TRIALS = 4  # trials that a prediction counts as: as a Beta prior it is then off by 0.2 or so, as predictions are
@@ -68,11 +68,12 @@ def halve(priors: Sequence[float], trials: int, attempt: Attempt, *, field: int 
 
 
 class Tried(WrittenPart):
-    """A candidate in a round: 1 or 0 for each of its trials."""
+    """A candidate in a round: 1 or 0 for each of its trials, and the success predicted of each, if it is."""
 
     row: str
     seed: int
     success: list[int]
+    predicted: list[float] = Field(default_factory=list)
 
 
 class TrialRound(WrittenPart):
@@ -80,6 +81,7 @@ class TrialRound(WrittenPart):
 
     trials: int
     candidates: list[tuple[str, int]]
+    predicted: list[list[float]] = Field(default_factory=list)  # of each candidate, from each start, if by hand
     tried: list[Tried] = Field(default_factory=list)
 
 
@@ -89,10 +91,12 @@ class TrialsFile(Artifact):
     trials: int
     field: int
     percent: int | None = None
+    by_hand: bool = False  # whether a person made them
     pseudo_trials: int
     rounds: list[TrialRound] = Field(default_factory=list)
     chosen: tuple[str, int] | None = None
     mean: float | None = None
+    rate: tuple[float, float, float] | None = None  # success of the chosen one, and the ends of its 95 % interval
 
     @property
     def spent(self) -> int:
@@ -264,30 +268,70 @@ def select_page(recipe: str, judged: Judgment, trials: TrialsFile | None = None)
     return markdown(f"{recipe}: choice without the target", sections)
 
 
+@dataclass(frozen=True)
+class Standing:
+    """A candidate after its trials so far: the posterior `mean` that ranks it, and its success `rate`."""
+
+    name: str
+    mean: float
+    rate: Estimate
+
+
+def standings(judged: Judgment, percent: int | None, rounds: Sequence[TrialRound]) -> dict[tuple[str, int], Standing]:
+    """Return where all that were tried in the last of `rounds` stand after it, the best predicted first."""
+    found = {}
+    for one in judged.ranked(percent):
+        key = (one.row, one.seed)
+        tried = [of for round_ in rounds for of in round_.tried if (of.row, of.seed) == key]
+        success, predicted = [n for of in tried for n in of.success], [n for of in tried for n in of.predicted]
+        if success and key in rounds[-1].candidates:
+            rate = success_rate(success, predicted, one.predicted, judged.episodes * len(one.success))
+            mean = posterior(one.lower, sum(success), len(success))
+            found[key] = Standing(one.name, mean, rate)
+    return found
+
+
+def advice(judged: Judgment, trials: TrialsFile) -> str:
+    """Return in a sentence who is ahead by how much, and whether more trials could change that."""
+    if not trials.spent:
+        return "Nothing is tried yet."
+    found = standings(judged, trials.percent, trials.rounds)
+    first, *others = sorted(found.values(), key=lambda one: -one.mean)
+    text = f"{first.name} is ahead, with a success of {interval(first.rate)}"
+    if len(found) < len(trials.rounds[-1].candidates):
+        return f"{text}; others of this round are still to be tried."
+    rival = max(others, key=lambda one: one.rate.high or 0.0)
+    if (first.rate.low or 0.0) > (rival.rate.high or 0.0):
+        return f"{text}. You can stop: all others of this round are below, at {rival.rate.high:.2f} or less."
+    go_on = ": go on" if trials.spent < trials.trials else ""
+    return f"{text}. {rival.name}, with {interval(rival.rate)}, may be as good{go_on}."
+
+
 def _trial_blocks(judged: Judgment, trials: TrialsFile) -> list[Text | TableBlock]:
-    priors = {(one.row, one.seed): one.lower for one in judged.ranked(trials.percent)}
-    every, lines = {key: list[int]() for key in priors}, list[list[str]]()
-    for number, one in ((number, one) for number, of in enumerate(trials.rounds, start=1) for one in of.tried):
-        found = every[one.row, one.seed]
-        found += one.success
-        mean = posterior(priors[one.row, one.seed], sum(found), len(found))
-        cells = (f"{number}", method_title(one.row), f"{one.seed}", f"{sum(one.success)}")
-        lines.append([*cells, f"{len(one.success)}", f"{mean:.2f}"])
-    state = "Not finished: run the same command again."
-    if trials.chosen and trials.mean is not None:
+    lines = list[list[str]]()
+    for number, round_ in enumerate(trials.rounds, start=1):
+        found = standings(judged, trials.percent, trials.rounds[:number])
+        for one in round_.tried:
+            if stands := found.get((one.row, one.seed)):
+                cells = (f"{number}", method_title(one.row), f"{one.seed}", f"{sum(one.success)}")
+                lines.append([*cells, f"{len(one.success)}", f"{stands.mean:.2f}", interval(stands.rate)])
+    if trials.chosen and trials.rate:
         row, seed = trials.chosen
-        name = f"**{method_title(row)}, seed {seed}**"
-        state = f"{name}: success {trials.mean:.2f}, estimated from the prediction and the trials."
+        state = f"**{method_title(row)}, seed {seed}**: success {interval(Estimate(*trials.rate))}."
+    else:
+        state = f"Not finished: run the same command again. {advice(judged, trials)}"
     size = f" at {trials.percent} %" if trials.percent else ""
+    told = " that predictions of the same trials make narrower (control variate)" if trials.by_hand else ""
     return [
         Text(
             f"{state} {trials.spent} of {trials.trials} episodes were used, on the {trials.field} candidates "
             f"that the prediction ranks highest{size}."
         ),
-        TableBlock("", ["round", "method", "seed", "succeeded", "of", "mean"], lines, words=2),
+        TableBlock("", ["round", "method", "seed", "succeeded", "of", "mean", "success [95 %]"], lines, words=2),
         Text(
             "Trials are split equally over rounds, and within a round over its candidates, which get the same starts "
             "and goals. After each round, the better half goes on. Mean: mean success over all trials of a candidate "
-            f"so far, with the judges' lower quartile as a prior worth {trials.pseudo_trials} trials."
+            f"so far, with the judges' lower quartile as a prior worth {trials.pseudo_trials} trials. Success: rate "
+            f"over the same trials, with Wilson's interval{told}."
         ),
     ]

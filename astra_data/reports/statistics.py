@@ -11,6 +11,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from statistics import NormalDist, fmean, linear_regression, pvariance
 
 import numpy as np
 
@@ -67,13 +68,58 @@ def summarize(scores: Sequence[float] | Floats, *, limit: float | None = None, t
         # more; at most all of them, and at least half an episode.
         drawn, variance = mean * (1 - mean), _variance(values) * (count + 1) / count
         episodes = min(max(drawn / variance if variance > 0 else math.inf, 0.5), count * trials)
-        extra = _student(count) ** 2 / episodes
-        center = (mean + extra / 2) / (1 + extra)
-        half = math.sqrt(drawn * extra + extra**2 / 4) / (1 + extra)
-        low, high = min(low, center - half), max(high, center + half)
+        wider = _wilson(mean, _student(count) ** 2 / episodes)
+        low, high = min(low, wider[0]), max(high, wider[1])
     if limit is not None:
         low, high = max(low, 0.0), min(high, limit)
     return Estimate(mean, low, high, float(values.std(ddof=1)), count)
+
+
+_PSEUDO_TRIALS = 2  # as if in so many more, the prediction had said nothing: a few may agree with it by chance
+_FEW = 3  # successes, or failures
+_NORMAL = NormalDist().inv_cdf((1 + CONFIDENCE) / 2)
+
+
+def success_rate(success: Sequence[float], predicted: Sequence[float], mean: float, episodes: int) -> Estimate:
+    """Return the rate of `success` (n,), 1 or 0, with an interval that predictions of the same trials make narrower.
+
+    `predicted` (n,) are the trials' own, or none; `mean` is that of `episodes` more, from starts drawn alike. The
+    control variate of PPI++: where trials began from easier starts than most, their rate is corrected by as much as the
+    prediction explains; the interval is Wilson's of as many trials as would vary as little as what it leaves.
+    """
+    count = len(success)
+    if not count:
+        return Estimate(mean, 0.0, 1.0)
+    rate, slope, left = fmean(success), 0.0, 0.0
+    value = rate
+    if predicted and len({*success}) > 1 and len({*predicted}) > 1:
+        slope = linear_regression(predicted, success).slope / (1 + count / episodes)
+        slope = min(max(slope, 0.0), 1.0)
+        value = min(max(rate + slope * (mean - fmean(predicted)), 0.0), 1.0)
+    trials = float(count)
+    if slope:
+        whole = max(value * (1 - value), rate * (1 - rate))
+        left = count * pvariance([one - slope * other for one, other in zip(success, predicted, strict=True)])
+        left = (left + _PSEUDO_TRIALS * whole) / (count - 1 + _PSEUDO_TRIALS)
+        trials *= whole / (left + slope**2 * mean * (1 - mean) * count / episodes)
+    low, high = _wilson(value, _NORMAL**2 / trials)
+    low, high = min(low, _least(value, trials)), max(high, 1.0 - _least(1.0 - value, trials))
+    return Estimate(value, max(low, 0.0), min(high, 1.0))
+
+
+def _least(rate: float, trials: float) -> float:
+    """Return Poisson's lower bound of a rate of few successes, for which Wilson's covers too rarely; 1 for more."""
+    from scipy.special import gammaincinv
+
+    few = rate * trials
+    return float(gammaincinv(few, 1 - CONFIDENCE)) / trials if 0 < few <= min(_FEW, trials / 4) else 1.0
+
+
+def _wilson(mean: float, extra: float) -> tuple[float, float]:
+    """Return the ends of Wilson's interval of a rate; `extra` is the quantile's square by the number of trials."""
+    center = (mean + extra / 2) / (1 + extra)
+    half = math.sqrt(mean * (1 - mean) * extra + extra**2 / 4) / (1 + extra)
+    return center - half, center + half
 
 
 def paired_difference(

@@ -57,7 +57,7 @@ def test_the_package_runs_as_a_module_does(tmp_path: Path) -> None:
         (["deploy", "runs/car", "--row", "nas"], "with astra-data run: did you mean 'runs/cart'?"),
         (["deploy", "runs/cart", "--row", "nas", "--out", "fake"], "fake exists already"),
         (["select", "none"], "none: expected the folder of a run (with recipe.json)"),
-        (["select", "runs/cart", "--field", "3"], "--field and --percent need --trials"),
+        (["select", "runs/cart", "--field", "3"], "--by-hand, --field and --percent need --trials"),
         (["view", "none"], "none: expected the folder of a run (with recipe.json)"),
     ],
 )

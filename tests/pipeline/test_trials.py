@@ -1,11 +1,13 @@
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 from unittest.mock import Mock
 
 import pytest
+import torch
 from rail_run import ROOT, rail_run
 from typer.testing import CliRunner
 
@@ -13,12 +15,13 @@ from astra_data.cli.app import app
 from astra_data.core.artifact import read_manifest
 from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import derive
+from astra_data.grounding.files import load_grounding
 from astra_data.pipeline import selecting as module
 from astra_data.pipeline.recipe import recorded_settings
 from astra_data.pipeline.selecting import choose_by_trials, select
 from astra_data.pipeline.trained_policy import TrainedPolicy, trained_policy
 from astra_data.policies.running_policy import RunningPolicy
-from astra_data.reports.choice import TrialsFile, halve
+from astra_data.reports.choice import TrialsFile, halve, standings
 
 pytestmark = pytest.mark.usefixtures("quick_fits")
 
@@ -66,7 +69,7 @@ def test_trials_are_made_in_the_target(folder: Path) -> None:
     assert [(of.trials, len(of.tried)) for of in record.rounds] == [(2, 4), (2, 2)]
     assert record.chosen is not None and record.chosen in record.rounds[-1].candidates
     row, seed = record.chosen
-    assert f"chosen with 12 trials: {row}, seed {seed}: success {record.mean:.2f}" in shown.output
+    assert record.rate and f"chosen with 12 trials: {row}, seed {seed}: success {record.rate[0]:.2f} [" in shown.output
     assert "## Trials in the target" in (folder / "select/select.md").read_text()
     manifest = read_manifest(folder / "select")
     assert manifest is not None and "trials.json" in manifest.files
@@ -173,6 +176,136 @@ def test_a_task_without_a_target_is_tried_nowhere(folder: Path) -> None:
     recipe.write_text(json.dumps(json.loads(recipe.read_text()) | task))
     with pytest.raises(BadInputError, match=r"expected a task with a target, got .*LOGS_ALONE: leave out"):
         choose_by_trials(folder, 12)
+
+
+Keys = Callable[[str], str]
+
+
+@pytest.fixture
+def predicted(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, Any, Any]]:
+    made = list[tuple[str, Any, Any]]()
+
+    def from_starts(recipe: object, config: object, one: Any, state: Any, goal: Any, *, root: Path) -> list[float]:
+        made.append((f"{one.row}/seed_{one.seed}", state, goal))
+        return [0.2 + 0.6 * (number % 2) for number in range(len(state))]
+
+    monkeypatch.setattr(module, "predicted_from", from_starts)
+    return made
+
+
+def pressing(key: Callable[[str], str], shown: list[str], *, quits_at: int = 0) -> Keys:
+    """Press for each trial what `key` says of it, and q at one of them."""
+
+    def ask(what: str) -> str:
+        shown.append(what)
+        return "q" if len(shown) == quits_at else key(what)
+
+    return ask
+
+
+def by_half(what: str) -> str:
+    return "s" if "astra" in what or "trial 1 " in what else "f"
+
+
+def test_a_person_makes_the_trials_and_may_stop_at_any(
+    folder: Path, tmp_path: Path, tries: Tries, predicted: list[Any]
+) -> None:
+    whole = Path(shutil.copytree(folder, tmp_path / "whole"))
+    shown = list[str]()
+    found = choose_by_trials(whole, 12, by_hand=pressing(by_half, shown))
+    assert len(shown) == 12 and not tries.made and found.by_hand and found.spent == 12
+    ranked = [f"{one.row}/seed_{one.seed}" for one in select(whole).ranked()]
+    assert [policy for policy, *_ in predicted[:4]] == ranked[:4] and len(predicted) == 6
+    # All of a round are predicted, and run, from the same starts to the same goals, and by what the sheet says.
+    lines = (whole / "select/trials.csv").read_text().splitlines()
+    goals = [float(line.split(",")[-2]) for line in lines[1:]]
+    assert goals[:8] == pytest.approx(predicted[0][2][:, 0].repeat_interleave(4).tolist(), rel=1e-3)
+    assert len({*goals[:8]}) == 2 and not {*goals[:8]} & {*goals[8:]}
+    expected = halve(
+        [one.lower for one in select(whole).ranked()],
+        12,
+        lambda number, those, each: [sum(one.success) for one in found.rounds[number].tried],
+    )
+    assert found.chosen and f"{found.chosen[0]}/seed_{found.chosen[1]}" == ranked[expected.chosen]
+    assert found.mean == expected.mean and found.rounds[0].tried[0].predicted == [0.2, 0.8]
+    rate = standings(select(whole), None, found.rounds)[found.chosen].rate
+    assert found.rate == (rate.value, rate.low, rate.high)
+    assert "is ahead, with a success of" in shown[-1]
+    assert "(control variate)" in (whole / "select/select.md").read_text()
+    for quits_at in (1, 4, 6, 3):
+        partly = choose_by_trials(folder, 12, by_hand=pressing(by_half, [], quits_at=quits_at))
+        assert partly.chosen is None and "Not finished" in (folder / "select/select.md").read_text()
+    assert partly.spent == 0 + 3 + 5 + 2
+    assert choose_by_trials(folder, 12, by_hand=pressing(by_half, [])) == found
+    assert (folder / "select/trials.csv").read_text() == (whole / "select/trials.csv").read_text()
+    assert choose_by_trials(folder, 12, by_hand=pressing(by_half, shown)) == found and len(shown) == 12
+    assert (folder / "select/trials.csv").is_file() and select(folder) == select(whole)
+
+
+def test_trials_by_hand_are_filled_into_the_sheet(folder: Path, predicted: list[Any]) -> None:
+    recipe, sheet = folder / "recipe.json", folder / "select/trials.csv"
+    command = ["select", str(folder), "--trials", "4", "--by-hand", "--field", "2"]
+    shown = CliRunner().invoke(app, command)  # without a terminal
+    assert shown.exit_code == 0, shown.output
+    assert "round 1, trial 1 of 4: run " in shown.output and "0 trials are made: fill in trials.csv" in shown.output
+    lines = sheet.read_text().splitlines()
+    sheet.write_text("\n".join([lines[0], lines[1] + "s", lines[2] + "perhaps", *lines[3:]]))
+    refused, before = CliRunner().invoke(app, command), sheet.read_text()
+    assert "line 3: expected success, failure, void or nothing as result, found perhaps" in str(refused.exception)
+    assert sheet.read_text() == before
+    voids, done = [line + "void" for line in lines[1:3]], [line + "s" for line in lines[1:]]
+    sheet.write_text("\n".join([lines[0], *voids, *done]))
+    shown = CliRunner().invoke(app, command)
+    assert "chosen with 4 trials: " in shown.output and ": success 1.00 [0.34, 1.00]" in shown.output
+    assert len(predicted) == 2 and read_manifest(folder / "select").faults(folder / "select", verify=True) == []  # type: ignore[union-attr]
+    with pytest.raises(BadInputError, match="by_hand = False, found 4 made with True: use the same settings"):
+        choose_by_trials(folder, 4, field=2)
+    recipe.write_text(json.dumps(json.loads(recipe.read_text()) | {"task": f"{ROOT}/tests/small_cart.py:LOGS_ALONE"}))
+    sheet.unlink()
+    with pytest.raises(BadInputError, match=r"trials.csv: expected the sheet of the trials, found .*No such file"):
+        choose_by_trials(folder, 4, field=2, by_hand=str)
+
+
+def test_results_that_a_later_round_was_not_planned_for_are_refused(folder: Path, predicted: list[Any]) -> None:
+    choose_by_trials(folder, 12, by_hand=pressing(by_half, [], quits_at=10))
+    sheet = folder / "select/trials.csv"
+    before = sheet.read_text()
+    turned = before.replace("success", "#").replace("failure", "success").replace("#", "failure")
+    sheet.write_text(turned)
+    with pytest.raises(BadInputError, match=r"trials.csv: expected the results that round 2 was planned for, found"):
+        choose_by_trials(folder, 12, by_hand=by_half)
+    sheet.write_text(before)
+    assert choose_by_trials(folder, 12, by_hand=by_half).spent == 12
+
+
+def test_keys_are_read_from_a_terminal(folder: Path, predicted: list[Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    keys = iter("SfvsX")
+    monkeypatch.setattr("astra_data.cli.recipes.sys", SimpleNamespace(stdin=SimpleNamespace(isatty=lambda: True)))
+    monkeypatch.setattr("typer.getchar", lambda: next(keys, "q"))
+    shown = CliRunner().invoke(app, ["select", str(folder), "--trials", "12", "--by-hand"])
+    assert "3 trials are made: fill in trials.csv" in shown.output and "s: success, f: failure" in shown.output
+    results = [line.rpartition(",")[2] for line in (folder / "select/trials.csv").read_text().splitlines()[1:]]
+    assert results[:5] == ["success", "failure", "void", "success", ""]
+
+
+def test_what_is_predicted_is_by_the_candidates_judges_from_the_starts(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = list[tuple[Any, ...]]()
+
+    def judged_from(*given: Any) -> torch.Tensor:
+        asked.append(given)
+        return torch.tensor([0.25, 1.0])
+
+    monkeypatch.setattr("astra_data.pipeline.stages.select.judged_from", judged_from)
+    found = choose_by_trials(folder, 4, field=2, by_hand=lambda _: "q")
+    assert found.rounds[0].predicted == [[0.25, 1.0]] * 2 and len(asked) == 2
+    for (row, seed), (_, judge, policy, state, goal, drawn) in zip(found.rounds[0].candidates, asked, strict=True):
+        assert (policy.source_encoder is None) == (row == "direct_transfer")
+        assert state.shape == goal.shape == (2, 1) and drawn == derive(1 - seed, f"predicted: {seed}")
+        other: Any = load_grounding(folder / f"ground/nas/seed_{1 - seed}/grounding.safetensors")
+        weights = (next(one.encoder.encoder.parameters()) for one in (judge, other))
+        assert torch.equal(*weights)
 
 
 def test_trials_are_of_the_size_that_is_asked_for(folder: Path, tries: Tries, monkeypatch: pytest.MonkeyPatch) -> None:

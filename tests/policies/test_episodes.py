@@ -179,7 +179,7 @@ def test_failures_are_drawn_in_the_whole_simulator_of_the_grounding(
 ) -> None:
     made = list[tuple[SimulatorEnv, int, int]]()
 
-    def seen(world: SimulatorEnv, begin: object, horizon: int, seed: int) -> object:
+    def seen(world: SimulatorEnv, begin: object, horizon: int, seed: int, starts: None) -> object:
         made.append((world, horizon, seed))
         raise StopIteration
 
@@ -192,6 +192,29 @@ def test_failures_are_drawn_in_the_whole_simulator_of_the_grounding(
     whole: Any = judge
     assert world.draws_failures and whole.failures is not None and whole.scatter_model is not None
     assert (used.failures, used.scatter_model) == (whole.failures, whole.scatter_model)
+
+
+@pytest.mark.usefixtures("quick_fits")
+def test_success_is_judged_from_each_start_alone(
+    judge: FittedGrounding, policy: RunningPolicy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    state, goal = torch.tensor([[0.0], [5.0], [0.25]]).double(), torch.tensor([[1.0], [1.5], [2.0]]).double()
+    begun, run = list[dict[str, Tensor]](), judging.in_simulator
+
+    def seen(world: SimulatorEnv, begin: Any, *given: Any, **more: Any) -> object:
+        def noted(goal: Tensor) -> Any:
+            begun.append({"state": world.simulator.state.clone(), "goal": goal.clone()})
+            return begin(goal)
+
+        outcome, _ = run(world, noted, *given, **more)
+        return replace(outcome, success=[1.0, 1.0, 0.0] * 9 + [1.0, 0.0, 0.0]), {}
+
+    monkeypatch.setattr(judging, "in_simulator", seen)
+    assert judging.judged_from(CART, judge, policy, state, goal, 7).tolist() == pytest.approx([1.0, 0.9, 0.0])
+    assert torch.equal(begun[0]["state"], state.float().repeat(10, 1))
+    assert torch.equal(begun[0]["goal"], goal.float().repeat(10, 1))
+    monkeypatch.setattr(judging, "in_simulator", run)
+    assert judging.judged_from(CART, judge, policy, state, goal, 7)[1] == 1.0  # where it begins beyond its goal
 
 
 TASK = TASKS["antmaze-umaze"]

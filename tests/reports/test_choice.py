@@ -21,6 +21,7 @@ from astra_data.reports.choice import (
     TrialRound,
     TrialsFile,
     Tried,
+    advice,
     choice_of,
     halve,
     least_trials,
@@ -28,9 +29,10 @@ from astra_data.reports.choice import (
     read_judged,
     read_trials,
     select_page,
+    standings,
     widest_field,
 )
-from astra_data.reports.statistics import summarize
+from astra_data.reports.statistics import interval, success_rate, summarize
 
 Line = tuple[str, int, float, float | None]
 
@@ -129,13 +131,48 @@ def test_the_page_says_who_was_tried_how_often_with_what_success(tmp_path: Path)
     assert read_trials(tmp_path / TRIALS) == BEGUN and BEGUN.spent == 4
     assert "Trials in the target" not in select_page("cart", JUDGED)
     page = select_page("cart", JUDGED, BEGUN)
-    assert "## Trials in the target\n\nNot finished: run the same command again. 4 of 9 episodes" in page
-    assert "| 1 | ASTRA | 1 | 1 | 2 | 0.50 |" in page and "| 1 | NAS | 1 | 2 | 2 | 0.50 |" in page
+    ahead = "ASTRA, seed 1 is ahead, with a success of 0.50 [0.09, 0.91]. NAS, seed 1, with 1.00 [0.34, 1.00]"
+    assert f"target\n\nNot finished: run the same command again. {ahead}, may be as good: go on. 4 of 9 epis" in page
+    assert "| 1 | ASTRA | 1 | 1 | 2 | 0.50 | 0.50 [0.09, 0.91] |" in page
+    assert "| 1 | NAS | 1 | 2 | 2 | 0.50 | 1.00 [0.34, 1.00] |" in page
     second = TrialRound(trials=2, candidates=[("nas", 1)], tried=[Tried(row="nas", seed=1, success=[1, 1])])
     done = BEGUN.model_copy(update={"rounds": [FIRST, second], "chosen": ("nas", 1), "mean": 0.625})
+    done = done.model_copy(update={"rate": (1.0, 0.51, 1.0)})
     page = select_page("cart", JUDGED, done)
-    assert "**NAS, seed 1**: success 0.62, estimated from the prediction and the trials. 6 of 9 episodes" in page
-    assert "| 2 | NAS | 1 | 2 | 2 | 0.62 |" in page  # (4 · 0.25 + 4) / (4 + 4)
+    assert "**NAS, seed 1**: success 1.00 [0.51, 1.00]. 6 of 9 episodes" in page
+    assert "| 2 | NAS | 1 | 2 | 2 | 0.62 | 1.00 [0.51, 1.00] |" in page  # (4 · 0.25 + 4) / (4 + 4)
+    assert "control variate" not in page
+    assert "(control variate)" in select_page("cart", JUDGED, done.model_copy(update={"by_hand": True}))
+
+
+def test_advice_is_to_go_on_until_the_best_is_above_all_others() -> None:
+    def after(astra: list[int], nas: list[int], trials: int = 99, **more: list[float]) -> str:
+        tried = [Tried(row="astra", seed=1, success=astra, **more), Tried(row="nas", seed=1, success=nas)]
+        of = TrialRound(trials=9, candidates=[("astra", 1), ("nas", 1)], tried=tried)
+        return advice(JUDGED, BEGUN.model_copy(update={"rounds": [of], "trials": trials}))
+
+    assert after([], []) == "Nothing is tried yet."
+    assert after([1], []) == (
+        "ASTRA, seed 1 is ahead, with a success of 1.00 [0.21, 1.00]; others of this round are still to be tried."
+    )
+    assert after([1] * 9, [0] * 9).endswith(
+        "success of 1.00 [0.70, 1.00]. You can stop: all others of this round are below, at 0.30 or less."
+    )
+    # NAS has the better trials; with its lower quartile of 0.25 as four more, and 0.5 for ASTRA.
+    assert after([1, 0], [1] * 9).startswith("NAS, seed 1 is ahead, with a success of 1.00 [0.70, 1.00]. ASTRA, seed 1")
+    assert after([1, 0], [1] * 9).endswith("may be as good: go on.")
+    assert after([1, 0], [1] * 9, trials=11).endswith("may be as good.")
+    # The prediction, 0.5 in ten episodes, explains the two failures of trials that it knows to be hard.
+    told = success_rate([1, 0, 1, 0], [0.9, 0.1, 0.9, 0.1], 0.5, 10)
+    assert interval(told) in after([1, 0, 1, 0], [0], predicted=[0.9, 0.1, 0.9, 0.1]) != after([1, 0, 1, 0], [0])
+
+
+def test_a_candidate_stands_by_all_its_trials_so_far() -> None:
+    second = TrialRound(trials=2, candidates=[("nas", 1)], tried=[Tried(row="nas", seed=1, success=[0, 1])])
+    found = standings(JUDGED, None, [FIRST, second])
+    assert [*found] == [("nas", 1)] and found["nas", 1].mean == (4 * 0.25 + 3) / 8
+    assert found["nas", 1].rate == success_rate([1, 1, 0, 1], [], 0.5, 10)
+    assert [*standings(JUDGED, None, [FIRST])] == [("astra", 1), ("nas", 1)]
 
 
 def drawn(success: Sequence[float], rng: np.random.Generator) -> Attempt:

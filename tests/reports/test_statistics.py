@@ -15,6 +15,7 @@ from astra_data.reports.statistics import (
     paired_difference,
     probability_of_improvement,
     spread,
+    success_rate,
     summarize,
 )
 
@@ -176,3 +177,69 @@ def test_figures_are_written_with_deviation_or_interval() -> None:
     assert (spread(found, 2), ends(found), interval(found)) == ("0.50 ± 0.25", "[0.12, 1.00]", "0.50 [0.12, 1.00]")
     assert (spread(Estimate(0.5), 0), interval(Estimate(0.5), 1)) == ("0", "0.5")
     assert (spread(None, 2), ends(None), interval(None)) == ("-", "-", "-")
+
+
+@pytest.mark.parametrize(("successes", "trials"), [(0, 7), (4, 8), (7, 7), (40, 60)])
+def test_a_rate_without_predictions_has_wilsons_interval(successes: int, trials: int) -> None:
+    outcomes = [1.0] * successes + [0.0] * (trials - successes)
+    expected = stats.binomtest(successes, trials).proportion_ci(method="wilson")
+    # Predictions that do not vary, or of trials that all end alike, change nothing.
+    for predicted in ([], [0.3] * trials):
+        found = success_rate(outcomes, predicted, 0.9, 500)
+        assert [found.value, found.low, found.high] == pytest.approx([successes / trials, expected.low, expected.high])
+    assert success_rate([1.0] * 3, [0.1, 0.2, 0.3], 0.9, 500) == success_rate([1.0] * 3, [], 0.9, 500)
+    assert success_rate([], [], 0.75, 500) == Estimate(0.75, 0.0, 1.0)
+
+
+def test_a_rate_is_corrected_by_what_the_prediction_explains() -> None:
+    outcomes, predicted = [1.0, 1.0, 0.0, 1.0, 0.0], [0.8, 0.6, 0.2, 0.8, 0.6]
+    # By hand: the covariance is 0.8 / 25 · 5 / 2 = 0.08 · 5 / 5, the variance of the predictions 0.048.
+    covariance, variance = np.cov(outcomes, predicted, ddof=0)[0, 1], np.var(predicted)
+    slope = covariance / variance / (1 + 5 / 20)
+    assert slope == pytest.approx(0.08 / 0.048 / 1.25) and slope > 1
+    slope = 1.0  # at most
+    value = 0.6 + slope * (0.4 - 0.6)
+    left = (np.sum((np.array(outcomes) - predicted - 0.0) ** 2) + 2 * 0.24) / (4 + 2) + 0.4 * 0.6 * 5 / 20
+    trials = 5 * 0.24 / left
+    center, half = (value + 1.96**2 / 2 / trials), 1.96 * np.sqrt(value * (1 - value) / trials + (0.98 / trials) ** 2)
+    found = success_rate(outcomes, predicted, 0.4, 20)
+    expected = [value, *((center + side * half) / (1 + 1.96**2 / trials) for side in (-1, 1))]
+    assert [found.value, found.low, found.high] == pytest.approx(expected, abs=1e-4)
+    # A smaller slope is taken as it is; one below 0 is none.
+    weak = success_rate([1.0, 0.0, 1.0, 0.0], [0.9, 0.5, 0.5, 0.1], 0.2, 4)
+    assert weak.value == pytest.approx(0.5 + 0.1 / 0.08 / 2 * (0.2 - 0.5))
+    assert success_rate([1.0, 0.0, 0.0], [0.1, 0.8, 0.9], 0.4, 20) == success_rate([1.0, 0.0, 0.0], [], 0.4, 20)
+    # It stays a rate, however far the starts were from usual ones.
+    beyond = success_rate([1.0, 1.0, 0.0, 1.0], [0.2, 0.2, 0.0, 0.2], 0.9, 10**6)
+    assert beyond.value == 1.0 and beyond.high == 1.0 and beyond.low is not None and beyond.low > 0.3
+
+
+@pytest.mark.parametrize("rate", [0.005, 0.985, 0.995])
+@pytest.mark.parametrize("count", [10, 20, 50])
+def test_the_interval_of_a_rate_near_an_end_covers_it(rate: float, count: int) -> None:
+    chances = stats.binom.pmf(np.arange(count + 1), count, rate)
+    found = [success_rate([1.0] * n + [0.0] * (count - n), [], 0.5, 1) for n in range(count + 1)]
+    is_covered = [one.low is not None and one.high is not None and one.low <= rate <= one.high for one in found]
+    assert chances @ is_covered >= 0.93  # of Wilson's, 0.86 at worst
+    # One success in ten: as rare as 5 % where 1 - exp(-10 · rate) is 0.05.
+    assert success_rate([1.0] + [0.0] * 9, [], 0.5, 1).low == pytest.approx(-np.log(0.95) / 10)
+
+
+@pytest.mark.parametrize("rates", [(0.5, 0.5), (0.2, 0.95), (0.0, 0.6), (0.97, 1.0), (0.02, 0.05)])
+@pytest.mark.parametrize("count", [10, 20, 50])
+def test_the_interval_of_a_rate_covers_it_and_is_narrower_where_the_prediction_is_good(
+    rates: tuple[float, float], count: int
+) -> None:
+    rng, covered, widths = np.random.default_rng(count), 0, np.zeros((1000, 2))
+    told = np.array([0.1, 0.7])  # of hard and of easy starts: wrong, but of the right order
+    for width in widths:
+        easy = rng.integers(2, size=count)
+        outcomes = rng.binomial(1, np.array(rates)[easy]).tolist()
+        mean = rng.binomial(400, told.mean()) / 400
+        found, alone = success_rate(outcomes, told[easy].tolist(), mean, 400), success_rate(outcomes, [], mean, 400)
+        assert found.low is not None and found.high is not None and alone.low is not None and alone.high is not None
+        covered += int(found.low <= np.mean(rates) <= found.high)
+        width[:] = found.high - found.low, alone.high - alone.low
+    assert covered >= 920
+    shorter = 1 - widths.mean(axis=0)[0] / widths.mean(axis=0)[1]
+    assert shorter > 0.12 if rates == (0.2, 0.95) else shorter > -0.03

@@ -6,6 +6,9 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
+import torch
+from torch import Tensor
+
 from astra_data.core.artifact import check_made_from, finished_folder
 from astra_data.core.config import AtOnce, Config
 from astra_data.core.durable import file_digest, write_file
@@ -16,7 +19,7 @@ from astra_data.core.provenance import origin
 from astra_data.core.seeding import derive
 from astra_data.grounding.files import GROUNDING, grounding_at, load_grounding
 from astra_data.methods import grounded_as, method_named
-from astra_data.policies.episodes import judged_success
+from astra_data.policies.episodes import judged_from, judged_success
 from astra_data.policies.running_policy import POLICY, PolicyFile, RunningPolicy, running
 from astra_data.reports.choice import FOLDER, SELECTED, Candidate, Judged, select_page
 from astra_data.reports.runs import Reported
@@ -108,6 +111,20 @@ def digests(of: list[Bench], root: Path) -> dict[str, str]:
     keys = dict.fromkeys(key for bench in of for key in bench.keys)
     files = {key: root / key / (POLICY if key.startswith("train/") else GROUNDING) for key in keys}
     return {key: file_digest(file) for key, file in files.items()}
+
+
+def predicted_from(
+    recipe: Reported, config: SelectConfig, one: Candidate, state: Tensor, goal: Tensor, *, root: Path
+) -> list[float]:
+    """Return a candidate's success with its judges from each of N states (N, X) with goals (N, G), as shares (N,)."""
+    bench = next(of for of in benches(recipe, judge_in(recipe, config)) if of.percent == one.percent)
+    entry = next(of for of in bench.entries if (of.row, of.seed) == (one.row, one.seed))
+    policy, found = entry.load(root, recipe.task), list[Tensor]()
+    for seed in one.success:
+        judge = load_grounding(root / bench.judges[seed] / GROUNDING)
+        found.append(judged_from(policy.task, judge, policy, state, goal, derive(seed, f"predicted: {entry.seed}")))
+    predicted: list[float] = torch.stack(found).mean(0).tolist()
+    return predicted
 
 
 def select(recipe: Reported, config: SelectConfig = SelectConfig(), *, root: Path, progress: Progress = silent) -> None:
