@@ -12,7 +12,7 @@ from astra_data.core.config import did_you_mean, only_given
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import first_few
 from astra_data.dataset.columns import Scalar, distinct_uids, renamed_metadata
-from astra_data.dataset.compare import schema_differences, world_differences
+from astra_data.dataset.compare import recordings_of, schema_differences, world_differences
 from astra_data.dataset.description import permutation
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import next_version
@@ -36,6 +36,8 @@ def subset(
     out: Path | None = None,
 ) -> Path:
     """Write a random subset; subsets with the same seed are nested, also subsets of subsets.
+
+    Copies of a recording, as `augment` makes them, go together: a tenth of the episodes is a tenth of the recordings.
 
     Args:
         source: the dataset.
@@ -70,6 +72,8 @@ def subset(
     chosen = source.subset_seed if seed is None else seed
     config: dict[str, Any] = {"episodes": count, "percent": percent, "of": of, "seed": chosen}
     order = permutation(source.uids.tolist(), chosen)
+    recording, first = dict(zip(source.uids.tolist(), recordings_of(source).tolist(), strict=True)), dict[int, int]()
+    order.sort(key=lambda uid: first.setdefault(recording[uid], len(first)))
     if stratify:
         order, strata = _stratified(source, stratify, chosen)
         config |= {"stratify": stratify, "strata": strata}

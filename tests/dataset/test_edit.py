@@ -1,4 +1,5 @@
 import itertools
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -75,6 +76,20 @@ def test_a_stratified_subset_keeps_shares_and_nesting(tmp_path: Path, count: int
         stepwise = subset(made, episodes=fewer, stratify="success", out=tmp_path / f"step{fewer}")
         assert uids(direct) == uids(stepwise) < uids(made.root)
         assert Dataset.open(stepwise).description["config"]["strata"] == {"False": 26, "True": 9}
+
+
+def test_copies_of_a_recording_go_together(tmp_path: Path) -> None:
+    with writer(tmp_path / "copies") as open_writer:
+        for uid in range(60):  # ten recordings, of each of which there are five copies
+            facts = {"source_episode": uid % 10} if uid >= 10 else {}
+            open_writer.add(replace(fake_episode(uid, 3), metadata=facts))
+    source, taken = Dataset.open(tmp_path / "copies"), set[int]()
+    for episodes in (1, 14, 18, 36):
+        found = uids(subset(source, episodes=episodes, out=tmp_path / f"{episodes}"))
+        assert taken < found and len({uid % 10 for uid in found}) == -(-episodes // 6)
+        taken = found
+    again = uids(subset(Dataset.open(tmp_path / "36"), episodes=14, out=tmp_path / "again"))
+    assert again == uids(tmp_path / "14")
 
 
 def test_shares_are_rounded_half_up() -> None:
