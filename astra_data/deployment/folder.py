@@ -8,6 +8,7 @@ from typing import Any
 
 from astra_data.core.artifact import write_manifest
 from astra_data.core.durable import atomic_folder, file_digest, refuse_existing
+from astra_data.core.errors import BadInputError
 from astra_data.core.provenance import origin
 from astra_data.dataset.columns import ACTION, GOAL, STATE, Column
 from astra_data.deployment.graph import INPUTS, ONNX, OUTPUTS, write_graph
@@ -50,6 +51,11 @@ def deploy(run: Path, row: str, out: Path, *, seed: int = 0, percent: int | None
     refuse_existing(out)
     trained = trained_policy(run, row, seed=seed, percent=percent)
     deployed = trained.running()
+    if deployed.sensing is not None:
+        raise BadInputError(
+            f"{row} acts on {', '.join(deployed.sensing.inputs)} in place of states, which a folder does not: act with "
+            "astra_data.load_policy, or align without inputs"
+        )
     digests = {stage: file_digest(path) for stage, path in trained.files.items()}
     with atomic_folder(out) as folder:
         parts, apart = write_graph(deployed, folder)

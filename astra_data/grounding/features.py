@@ -70,8 +70,10 @@ ENCODER = ColorPlaces()
 
 
 @cache
-def encoder_named(name: str) -> PictureEncoder:
-    """Return the encoder "file.py:NAME"; a class is made without arguments."""
+def encoder_named(name: str, sha256: str = "") -> PictureEncoder:
+    """Return the encoder "file.py:NAME", whose file has this sha256, if one is given; a class is made there."""
+    if sha256 and file_of(name).get("file_sha256", sha256) != sha256:
+        raise BadInputError(f"{name} changed since it made the features: restore it, or make them again")
     made = user_object(name)
     with explained(f"making {name}"):
         made = made() if isinstance(made, type) else made
@@ -84,11 +86,11 @@ def encoder_named(name: str) -> PictureEncoder:
     return encoder
 
 
-def encoded(name: str, pictures: NDArray[Any]) -> NDArray[np.float32]:
-    """Return the features (B, size) of pictures (B, H, W, 3) by the encoder `name`."""
+def encoded(pictures: NDArray[Any], name: str, sha256: str = "") -> NDArray[np.float32]:
+    """Return the features (B, size) of pictures (B, H, W, 3) by an encoder, see `encoder_named`."""
     if pictures.ndim != 4 or pictures.shape[-1] != 3 or pictures.dtype != np.uint8:
         raise BadInputError(f"expected pictures (B, H, W, 3) of uint8, got {pictures.dtype} of shape {pictures.shape}")
-    encoder = encoder_named(name)
+    encoder = encoder_named(name, sha256)
     with explained(f"encoding pictures by {name}"):
         features = np.asarray(encoder(pictures), np.float32)
     if features.shape != (expected := (len(pictures), encoder.size)):
@@ -137,7 +139,7 @@ def features(
     ) as writer:
         for index, episode in enumerate(source.episodes()):
             blocks = batched(pictures_of(episode.cameras[camera]), _AT_ONCE)
-            values = np.concatenate([encoded(encoder, np.stack(block)) for block in blocks])
+            values = np.concatenate([encoded(np.stack(block), encoder) for block in blocks])
             writer.add(replace(episode, columns={**episode.columns, column: as_column(values)}))
             progress((index + 1) / len(source), f"episode {index + 1} of {len(source)}")
     return writer.root

@@ -1,6 +1,6 @@
 """Windows of paired episodes, which the grounding model learns from."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -76,7 +76,7 @@ _COLUMNS = (
 class PairedEpisodes:
     """E paired episodes, padded at the end to T steps."""
 
-    target_state: Tensor  # s_i, (E, T, S)
+    target_state: Tensor  # s_i, or the inputs in its place, (E, T, S)
     reward: Tensor  # the target's, r_i, (E, T)
     terminated: Tensor  # (E, T) bool, the task ended there, in success or failure; not set by time-outs
     windows: PairedWindows  # everything else, (E, T, ...), with the mask of real steps
@@ -95,12 +95,16 @@ class PairedEpisodes:
         return {"dataset": self.reference, "hash": self.content_hash}
 
     @classmethod
-    def load(cls, root: str | Path, device: str = "cpu") -> "PairedEpisodes":
-        """Read the paired dataset at `root`, actions as ±1; a last step that was made up joins the one before."""
+    def load(cls, root: str | Path, device: str = "cpu", inputs: Sequence[str] = ()) -> "PairedEpisodes":
+        """Read the paired dataset at `root`, actions as ±1; a last step that was made up joins the one before.
+
+        The columns `inputs`, one after another, stand in for the target's state.
+        """
         dataset = open_dataset(root)
         if names.ABSTRACT_STATE not in dataset.features:
             raise BadInputError(f"{root} has no column {names.ABSTRACT_STATE}: expected a dataset that was paired")
-        columns = dataset.columns([*_COLUMNS, *({names.GOAL, names.REWARD, names.SUCCESS} & dataset.features.keys())])
+        known = {names.GOAL, names.REWARD, names.SUCCESS} & dataset.features.keys()
+        columns = dataset.columns(list(dict.fromkeys([*_COLUMNS, *known, *inputs])))
         lengths, held_out = dataset.lengths, np.array(dataset.metadata.get("held_out", ()), dtype=bool)
         uids, recordings = dataset.uids, recordings_of(dataset)
         if (made_up := _made_up(dataset, columns)).any():
@@ -127,7 +131,7 @@ class PairedEpisodes:
         reward = padded.get(names.REWARD, torch.zeros_like(terminated, dtype=action.dtype))
         failed = terminated & ~padded.get(names.SUCCESS, terminated)
         return cls(
-            target_state=padded[names.STATE],
+            target_state=torch.cat([padded[name] for name in inputs or (names.STATE,)], dim=-1).float(),
             reward=reward,
             terminated=terminated,
             windows=PairedWindows(
@@ -149,7 +153,7 @@ class PairedEpisodes:
             uids=torch.tensor(uids, device=device),
             recordings=torch.tensor(recordings, device=device),
             held_out=torch.tensor(held_out, device=device) if held_out.any() else None,
-            dropped_place=_dropped_place(dataset),
+            dropped_place=() if inputs else _dropped_place(dataset),
             commands=commands,
         )
 

@@ -369,6 +369,7 @@ def data_condition(recipe: Recipe) -> Condition | None:
         raise BadInputError(f"data: {source.reference} is paired already, but a recipe pairs its data itself: {advice}")
     task = task_named(recipe.task)
     check_fits(source, task)
+    source.specs(recipe.align.inputs)
     grounds = any(method_named(row).grounds for row in recipe.methods)
     if grounds and not any(source.metadata.get("held_out", ())):
         name, recordings = source.reference, len(set(recordings_of(source)))

@@ -50,6 +50,8 @@ def _held_out_as_ground(table: object, info: ValidationInfo) -> object:
     """Hold out what `[ground]` does: an alignment would be judged on what grounding trained on."""
     if "ground" not in info.data or not isinstance(table, dict):
         return table
+    if table.get("inputs") and info.data.get("data") is None:
+        raise ValueError("inputs: expected a recipe with `data`, since `collect` records states alone")
     share = info.data["ground"].held_out_share
     if (asked := table.get("held_out_share", share)) != share:
         raise ValueError(f"held_out_share: expected that of [ground], {share!r}, got {asked!r}")

@@ -44,11 +44,13 @@ class TrainedPolicy:
         """Return it ready to act, with the encoder that it is deployed with, if it has one."""
         encoder = load_target_encoder(self.files["align"]) if "align" in self.files else None
         asked = self.settings.get("evaluate", {}).get("encoder")
+        is_used = encoder is not None and (asked == "target" or (asked is None and encoder.is_deployed))
         return running(
             task_named(self.settings["task"]),
             self.file,
             grounding_at(self.files.get("ground")),
-            encoder if encoder is not None and (asked or encoder.is_deployed) else None,
+            encoder if is_used else None,
+            encoder if encoder is not None and encoder.inputs else None,
         )
 
 
@@ -79,6 +81,9 @@ def load_policy(run: str | Path, row: str, *, seed: int = 0, percent: int | None
         >>> policy = load_policy("runs/antmaze_quick", "astra")
         >>> policy.start(1)
         >>> velocity = policy.command(state, goal)  # (1, 29) and (1, 2) in, (1, 2) in m/s out
+
+    With `[align] inputs`, `command` takes these by name instead of a state, or pictures instead of their features:
+    `policy.command({"observation.images.front": pictures}, goal)`.
     """
     return trained_policy(run, row, seed=seed, percent=percent).running()
 
@@ -116,7 +121,8 @@ def _files(settings: dict[str, Any], folder: Path, row: str, seed: int, percent:
         check_unchanged(own_methods[name]["method"], folder, name=name)
     if method.grounds:
         files["ground"] = folder / artifact_key("ground", base, seed, percent) / GROUNDING
-    if method.aligns and (settings.get("evaluate") or {}).get("encoder") != "source":
+    is_read = (settings.get("align") or {}).get("inputs") or (settings.get("evaluate") or {}).get("encoder") != "source"
+    if method.aligns and is_read:
         files["align"] = folder / artifact_key("align", base, seed, percent) / TARGET_ENCODER
     if missing := [f"{path} (astra-data {stage})" for stage, path in files.items() if not path.is_file()]:
         raise BadInputError(f"{row}, seed {seed}: expected {', '.join(missing)}: run the recipe first")

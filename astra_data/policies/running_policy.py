@@ -14,6 +14,7 @@ from astra_data.core.checkpoint import as_part, loaded, part_of, save_tensors, u
 from astra_data.core.errors import BadInputError
 from astra_data.grounding.alignment import TargetEncoder
 from astra_data.grounding.encoder import LatentEncoder
+from astra_data.grounding.features import encoded
 from astra_data.grounding.simulator import NO_GROUNDING, Grounding
 from astra_data.policies import networks
 from astra_data.policies.networks import Policy, PolicyShape
@@ -89,6 +90,7 @@ class UserPolicy(Policy):
 
 
 Given = Tensor | NDArray[np.float32] | NDArray[np.float64]  # what measures and goals come in
+Shown = Mapping[str, Given | NDArray[np.uint8]]  # in place of states: columns, or pictures, by their names
 
 EncoderKind = Literal["target", "source"]
 Observed = Literal["abstract", "full"]
@@ -111,7 +113,10 @@ class Memory(NamedTuple):
 
 @dataclass
 class RunningPolicy:
-    """A policy that acts on B robots. Latents come from ψ^t on full states, or from ψ^s on φ of them."""
+    """A policy that acts on B robots. Latents come from ψ^t on full states, or from ψ^s on φ of them.
+
+    With `sensing`, the `inputs` of an aligned encoder take the place of states, and its estimate that of φ(s).
+    """
 
     task: Task
     policy: Policy
@@ -119,6 +124,17 @@ class RunningPolicy:
     target_encoder: LatentEncoder | None = None  # ψ^t; where it is None, ψ^s is used
     command_limit: float = NO_LIMIT  # that of the environment in which the policy was trained
     observed: Observed = "abstract"  # whether the policy observes φ of the target's state, or the full state
+    sensing: TargetEncoder | None = None
+
+    def __post_init__(self) -> None:
+        """Check that what the encoder reads is there."""
+        reads = getattr(self.target_encoder, "inputs", None)
+        if reads and self.sensing is None:
+            raise BadInputError(
+                f"the target encoder reads {', '.join(reads)}, of which the target of a task shows none"
+            )
+        if self.sensing is not None and self.observed == "full":
+            raise BadInputError(f"the policy observes full states: expected no {', '.join(self.sensing.inputs)}")
 
     @property
     def observation_size(self) -> int:
@@ -134,6 +150,8 @@ class RunningPolicy:
         encoder = self.target_encoder or self.source_encoder
         encoded = torch.zeros(count, 0) if encoder is None else encoder.encoder.initial(count)
         self.resume(Memory(still, still, self.policy.initial_hidden(count), encoded))
+        if self.sensing is not None:
+            self._estimated = self.sensing.estimator.initial(count)
         self._generator = generator
 
     def resume(self, memory: Memory) -> None:
@@ -141,15 +159,40 @@ class RunningPolicy:
         self.memory = memory
         self._generator = None
 
-    def command(self, state: Given, goal: Given) -> Tensor:
-        """Return commands (B, A), in their own units, for target states (B, S) and goals (B, G)."""
+    def command(self, state: Given | Shown, goal: Given) -> Tensor:
+        """Return commands (B, A), in their own units, for target states (B, S) and goals (B, G).
+
+        A policy with `inputs` in the place of states takes these by name, (B, size) each; in place of features, it also
+        takes the pictures of their camera, (B, H, W, 3) uint8.
+        """
         if not hasattr(self, "memory"):
             raise BadInputError("expected start(count) before the first command")
-        state = self._checked("state", state, self.task.state.size)
+        read = self._state(state) if self.sensing is None else self._inputs(state, self.sensing)
         goal = self._checked("goal", goal, self.task.objective.goal_size)
-        return self.task.limits.in_units(self.act(state, goal))
+        return self.task.limits.in_units(self.act(read, goal))
 
-    def _checked(self, name: str, given: Given, size: int) -> Tensor:
+    def _state(self, given: Given | Shown) -> Tensor:
+        if isinstance(given, Mapping):
+            raise BadInputError("expected states, got a dict, which policies take that were aligned with `inputs`")
+        return self._checked("state", given, self.task.state.size)
+
+    def _inputs(self, given: Given | Shown, sensing: TargetEncoder) -> Tensor:
+        """Return the inputs in the place of states, (B, S), features of pictures among them."""
+        shown, read = given if isinstance(given, Mapping) else {}, list[Tensor]()
+        for name, size in sensing.inputs.items():
+            made_by = sensing.pictures.get(name, {})
+            camera = made_by.get("camera", name)
+            if name not in shown and camera not in shown:
+                wanted = name if camera == name else f"{name}, or pictures of {camera}"
+                got = "another value" if given is not shown else ", ".join(shown) or "an empty one"
+                raise BadInputError(f"this policy takes a dict in place of states: expected {wanted}, got {got}")
+            values = shown[name if name in shown else camera]
+            if name not in shown:
+                values = encoded(np.asarray(values), made_by["encoder"], made_by.get("file_sha256", ""))
+            read.append(self._checked(name, values, size))
+        return torch.cat(read, dim=-1)
+
+    def _checked(self, name: str, given: Given | NDArray[np.uint8], size: int) -> Tensor:
         values, shape = torch.as_tensor(given, dtype=torch.float32), (len(self.memory.policy), size)
         if values.shape != shape:
             raise BadInputError(f"{name}: expected the shape {shape}, got {tuple(values.shape)}")
@@ -161,7 +204,13 @@ class RunningPolicy:
         return values
 
     def act(self, state: Tensor, goal: Tensor) -> Tensor:
-        """Return actions (B, A), of ±1 along each axis, for target states (B, S) and goals (B, G)."""
+        """Return actions (B, A), of ±1 along each axis, for target states, or inputs, (B, S) and goals (B, G)."""
+        if self.sensing is not None:
+            abstract = self._estimate(self.sensing, state, goal)
+            if self.target_encoder is None:
+                return self.act_in_simulator(abstract, goal)
+            latent = self._latent(self.target_encoder, state, goal)
+            return self._act(policy_observation(self.task.objective, abstract, goal, latent))
         seen = self.task.abstraction(state) if self.target_encoder is None else state
         latent = self._latent(self.target_encoder or self.source_encoder, seen, goal)
         return self._act(target_observation(self.task, state, goal, latent, self.observed))
@@ -170,6 +219,12 @@ class RunningPolicy:
         """Return actions (B, A) for abstract states (B, X) and goals (B, G); latents come from ψ^s."""
         latent = self._latent(self.source_encoder, abstract, goal)
         return self._act(policy_observation(self.task.objective, abstract, goal, latent))
+
+    @torch.no_grad()
+    def _estimate(self, sensing: TargetEncoder, inputs: Tensor, goal: Tensor) -> Tensor:
+        read = sensing.encoder_input(inputs, goal, self.memory.previous_action)
+        self._estimated = sensing.estimator.step(read, self._estimated)
+        return sensing.estimates(self._estimated)
 
     @torch.no_grad()
     def _latent(self, encoder: LatentEncoder | None, seen: Tensor, goal: Tensor) -> Tensor | None:
@@ -257,11 +312,18 @@ class PolicyFile:
 
 
 def running(
-    task: Task, trained: PolicyFile, grounding: Grounding = NO_GROUNDING, target_encoder: TargetEncoder | None = None
+    task: Task,
+    trained: PolicyFile,
+    grounding: Grounding = NO_GROUNDING,
+    target_encoder: TargetEncoder | None = None,
+    sensing: TargetEncoder | None = None,
 ) -> RunningPolicy:
-    """Return the policy, ready to be started; latents, if any, come from ψ^t, or without it from ψ^s."""
+    """Return the policy, ready to be started; latents, if any, come from ψ^t, or without it from ψ^s.
+
+    What `sensing` reads and estimates takes the place of states.
+    """
     limit = trained.simulation.world.command_limit if trained.simulation else NO_LIMIT
-    made = RunningPolicy(task, trained.policy, grounding.encoder, target_encoder, limit, trained.observed)
+    made = RunningPolicy(task, trained.policy, grounding.encoder, target_encoder, limit, trained.observed, sensing)
     if made.observation_size != (taken := trained.policy.shape.observation_size):
         raise BadInputError(
             f"the policy takes {taken} values, {task.name} gives {made.observation_size}: expected a "

@@ -8,7 +8,7 @@ from fake_dataset import writer
 from typer.testing import CliRunner
 
 from astra_data.cli.app import app
-from astra_data.core.errors import BadInputError
+from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.core.progress import silent
 from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE, Column, Episode
 from astra_data.pipeline.run import check, run
@@ -149,3 +149,13 @@ def test_a_task_of_ones_own_is_walked_through_before_a_run(recipe: Path) -> None
     with pytest.raises(BadInputError, match=r"rail.py:TASK: objective.reward.*'nothing'.* \(rail.py, line \d+\)"):
         run(recipe, root=recipe.parent / "runs")
     assert not (recipe.parent / "runs/rail/label").exists()
+
+
+def test_inputs_of_the_target_encoder_are_looked_for_before_any_fit(recipe: Path, tmp_path: Path) -> None:
+    write_logs(tmp_path / "logs", -1.0, 4.0)
+    recipe.write_text(recipe.read_text() + '[align]\ninputs = ["observation.features.front"]\n')
+    with pytest.raises(BadInputError, match=r"has no column observation.features.front; it has observation.state"):
+        run(recipe, root=tmp_path / "runs")
+    recipe.write_text(recipe.read_text().replace('data = "logs"\n', "").replace("rail.py:TASK", "antmaze-umaze"))
+    with pytest.raises(RecipeError, match="inputs: expected a recipe with `data`, since `collect` records states"):
+        check(recipe, root=tmp_path / "runs")

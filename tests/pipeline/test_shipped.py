@@ -39,7 +39,10 @@ def test_a_copy_brings_nothing_but_what_is_needed(tmp_path: Path) -> None:
 
     assert copied("leg_scale") == ["antmaze_umaze.toml", "leg_scale.toml"]
     assert {"imports/nao_guda.toml", "examples/recorded/windows.py"} < {*copied("nao_real")}
-    assert copied("quickstart") == ["examples/cart/cart.py", "examples/cart/robot.py", "quickstart.toml"]
+    assert copied("quickstart") == [
+        *(f"examples/cart/{one}.py" for one in ("camera", "cart", "robot")),
+        "quickstart.toml",
+    ]
     assert "examples/cart/robot.py" in copied("methods")
     assert "examples/cart/logs.toml" in copied("cart")  # its head names it
     for path in (tmp_path / "quickstart").rglob("*.*"):
@@ -66,5 +69,5 @@ def test_the_command_line_lists_and_copies(tmp_path: Path) -> None:
     assert [names.count(recipe.name) for recipe in shipped_recipes()] == [1] * len(shipped_recipes())
     assert max(map(len, listed)) <= 80 and "ros2_base" in "\n".join(listed).partition("Mappings")[2]
     copied = CliRunner().invoke(app, ["recipes", "copy", "quickstart", str(tmp_path)])
-    assert copied.output == f"finished: 3 files; astra-data run {tmp_path}/quickstart.toml\n"
+    assert copied.output == f"finished: 4 files; astra-data run {tmp_path}/quickstart.toml\n"
     assert (tmp_path / "quickstart.toml").is_file()

@@ -2,12 +2,18 @@ import json
 import re
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
+from small_run import ALIGN
 
 from astra_data.core.errors import BadInputError
+from astra_data.dataset.columns import STATE
+from astra_data.deployment.folder import deploy
 from astra_data.grounding.files import load_grounding, load_target_encoder
+from astra_data.pipeline.stages.align import align
+from astra_data.pipeline.stages.evaluate import EvaluateConfig, evaluate
 from astra_data.pipeline.trained_policy import load_policy, settings_of, trained_policy
 from astra_data.policies.running_policy import PolicyFile, running
 from astra_data.robots.registry import TASKS
@@ -149,3 +155,40 @@ def test_no_run_and_no_policy_are_refused(run: Path, tmp_path: Path) -> None:
         load_policy(tmp_path, "astra")
     with pytest.raises(BadInputError, match="follower has no trained policy"):
         load_policy(run, "follower")
+
+
+def test_a_policy_aligned_with_inputs_runs_by_them_and_is_not_deployed_as_a_folder(
+    run: Path, paired: Path, grounded: Path, tmp_path: Path
+) -> None:
+    folder = Path(shutil.copytree(run, tmp_path / "run"))
+    shutil.rmtree(folder / "align")
+    config = ALIGN.model_copy(update={"updates": 3, "inputs": (STATE,)})
+    align(config, dataset=paired, grounding=grounded, out=folder / "align/astra/seed_0")
+    state, goal = torch.randn(1, 29), torch.randn(1, 2)
+    commands = {}
+    for encoder in ("target", "source", None):
+        settings = {"task": "antmaze-umaze", "evaluate": {"encoder": encoder} if encoder else {}}
+        (folder / "recipe.json").write_text(json.dumps(settings | {"align": {"inputs": [STATE]}}))
+        policy = load_policy(folder, "astra")
+        assert policy.sensing is not None and (policy.target_encoder is None) == (encoder != "target")
+        policy.start(1)
+        commands[encoder] = policy.command({STATE: state}, goal)
+    assert torch.equal(commands["source"], commands[None]) and not torch.equal(commands["source"], commands["target"])
+    with pytest.raises(
+        BadInputError, match=r"astra acts on observation[.]state in place of states, which a folder does not"
+    ):
+        deploy(folder, "astra", tmp_path / "deployed")
+    with pytest.raises(
+        BadInputError, match=r"the target encoder reads observation[.]state, of which the target of a task"
+    ):
+        evaluate_with(folder, "target", tmp_path / "evaluation")
+    evaluate_with(folder, None, tmp_path / "evaluation")
+    found = json.loads((tmp_path / "evaluation/evaluation.json").read_text())
+    assert found["encoder"] == "source" and [*found["encoders"]] == ["source"]
+
+
+def evaluate_with(run: Path, encoder: Any, out: Path) -> None:
+    config = EvaluateConfig(episodes=1, encoder=encoder)
+    parts = {"policy": "train", "grounding": "ground", "target_encoder": "align"}
+    folders: dict[str, Any] = {name: run / stage / "astra/seed_0" for name, stage in parts.items()}
+    evaluate("antmaze-umaze", "astra", config, **folders, out=out)

@@ -9,13 +9,14 @@ from small_cart import TASK as RAIL_CART
 from torch import Tensor
 from toy_episodes import no_episodes
 
+from astra_data.core.durable import file_digest
 from astra_data.core.errors import BadInputError
 from astra_data.grounding.alignment import TargetEncoder
 from astra_data.grounding.files import save_grounding
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.model import GroundingModel, GroundingShape
 from astra_data.policies.networks import ActorCritic, ActorCriticShape, AdaptiveShape, Student
-from astra_data.policies.running_policy import KINDS, Array, PolicyFile, RunningPolicy, UserPolicy
+from astra_data.policies.running_policy import KINDS, Array, PolicyFile, RunningPolicy, Shown, UserPolicy
 from astra_data.policies.simulator_env import Simulation, WorldConfig, policy_observation
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.variation import PlanarVariation
@@ -58,6 +59,92 @@ def test_latents_are_those_of_the_whole_history(aligned: bool, in_simulator: boo
     torch.testing.assert_close(actions, policy.policy(observation)[0], atol=1e-5, rtol=0)
     assert actions.abs().max() > 0.1
     assert running.observation_size == 16 and RunningPolicy(TASK, policy, observed="full").observation_size == 33
+
+
+def sensing(**pictures: Any) -> TargetEncoder:
+    """An encoder that reads two columns in place of states; its estimates are of some size."""
+    read: dict[str, Any] = {"inputs": {"observation.features.front": 3, "observation.joints": 26}, "pictures": pictures}
+    read |= {"abstract_size": 4, "unit_vectors": []}
+    encoder = TargetEncoder(29, 2, 2, embedding_size=8, latent_size=8, position_octaves=0, sensing=read)
+    encoder.abstract_std.fill_(3.0)
+    return encoder
+
+
+@pytest.mark.parametrize("aligned", [True, False])
+@torch.no_grad()
+def test_with_inputs_the_policy_observes_an_estimate_in_place_of_phi(aligned: bool) -> None:
+    torch.manual_seed(0)
+    model, eyes = GroundingModel(GroundingShape(4, 2, 2, latent_size=8)), sensing()
+    policy = ActorCritic(ActorCriticShape(observation_size=16, action_size=2))
+    for layer in policy.actor.parameters():
+        layer.mul_(10)
+    running = RunningPolicy(TASK, policy, model, eyes if aligned else None, sensing=eyes)
+    running.start(3)
+    names = [*eyes.inputs]
+    given: list[Shown] = [{names[0]: STATE[:, step, :3], names[1]: STATE[:, step, 3:].numpy()} for step in range(6)]
+    actions = TASK.limits.normal(torch.stack([running.command(one, GOAL) for one in given], dim=1))
+    read = eyes.encoder_input(STATE, GOALS, previous(actions))
+    abstract = eyes.estimates(eyes.estimator.sequence(read)[1])
+    if aligned:
+        latent, _ = eyes.encoder(read)
+    else:
+        latent, _ = model.encoder(model.encoder_input(abstract, GOALS, previous(actions)))
+    observation = policy_observation(TASK.objective, abstract, GOALS, latent)
+    torch.testing.assert_close(actions, policy.policy(observation)[0], atol=1e-5, rtol=0)
+    running.start(3)  # forgets
+    torch.testing.assert_close(running.act(STATE[:, 0], GOAL), actions[:, 0], atol=1e-5, rtol=0)
+
+
+@torch.no_grad()
+def test_in_place_of_features_come_pictures_of_their_camera(tmp_path: Path) -> None:
+    code, camera = tmp_path / "eyes.py", "observation.images.front"
+    code.write_text(
+        "import numpy as np\nclass Eyes:\n size = 3\n"
+        " def __call__(self, pictures):\n  return pictures[:, 0, 0].astype(np.float32)\n"
+    )
+    origin = {"camera": camera, "encoder": f"{code}:Eyes", "file_sha256": file_digest(code)}
+    eyes = sensing(**{"observation.features.front": origin})
+    policy = ActorCritic(ActorCriticShape(observation_size=8, action_size=2))
+    running = RunningPolicy(TASK, policy, sensing=eyes)
+    pictures = np.random.default_rng(0).integers(0, 255, (3, 4, 4, 3)).astype(np.uint8)
+    features, joints = pictures[:, 0, 0].astype(np.float32), STATE[:, 0, 3:]
+    commands = []
+    shown: list[Shown] = [{camera: pictures}, {"observation.features.front": features}]
+    for seen in shown:
+        running.start(3)
+        commands.append(running.command({**seen, "observation.joints": joints}, GOAL))
+    assert torch.equal(*commands)
+    refused: list[tuple[Any, str]] = [
+        (
+            STATE[:, 0],
+            "takes a dict in place of states: expected observation.features.front, or pictures of observation",
+        ),
+        ({camera: pictures}, "expected observation.joints, got observation.images.front"),
+        ({camera: pictures[:2], "observation.joints": joints}, r"expected the shape \(3, 3\), got \(2, 3\)"),
+        ({camera: pictures / 255.0, "observation.joints": joints}, "of uint8, got float64"),
+    ]
+    for wrongly, message in refused:
+        with pytest.raises(BadInputError, match=message):
+            running.command(wrongly, GOAL)
+    wrong = sensing(**{"observation.features.front": origin | {"file_sha256": "0" * 64}})
+    running = RunningPolicy(TASK, policy, sensing=wrong)
+    running.start(3)
+    with pytest.raises(BadInputError, match="changed since it made the features"):
+        running.command({camera: pictures, "observation.joints": joints}, GOAL)
+
+
+def test_states_and_inputs_are_not_taken_for_each_other() -> None:
+    policy = ActorCritic(ActorCriticShape(observation_size=8, action_size=2))
+    running = RunningPolicy(TASK, policy)
+    running.start(1)
+    with pytest.raises(BadInputError, match="expected states, got a dict"):
+        running.command({"observation.joints": STATE[:1, 0]}, GOAL[:1])
+    with pytest.raises(
+        BadInputError, match=r"reads observation[.]features[.]front, observation[.]joints, of which the target"
+    ):
+        RunningPolicy(TASK, policy, target_encoder=sensing())
+    with pytest.raises(BadInputError, match="the policy observes full states"):
+        RunningPolicy(TASK, policy, observed="full", sensing=sensing())
 
 
 @torch.no_grad()

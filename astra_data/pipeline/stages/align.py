@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import torch
-from pydantic import Field
+from pydantic import Field, field_validator
 from torch import Tensor
 
 from astra_data.core.artifact import CHECKPOINT, finished_folder
@@ -14,8 +14,10 @@ from astra_data.core.durable import file_digest
 from astra_data.core.progress import Progress, silent
 from astra_data.core.provenance import origin
 from astra_data.core.seeding import derive
-from astra_data.grounding.alignment import TargetEncoder, gaussian_mmd
+from astra_data.dataset.versions import open_dataset
+from astra_data.grounding.alignment import TargetEncoder, gaussian_mmd, unit_vectors
 from astra_data.grounding.descent import Descent, WindowedConfig
+from astra_data.grounding.features import MADE_BY
 from astra_data.grounding.files import GROUNDING, TARGET_ENCODER, load_history_model, save_target_encoder
 from astra_data.grounding.model import GroundingModel
 from astra_data.grounding.paired_episodes import PairedEpisodes, PairedWindows
@@ -34,6 +36,16 @@ class AlignConfig(WindowedConfig):
     held_out_share: Annotated[float, Field(gt=0, lt=1)] = 0.1
     """Fraction of the episodes to hold out for measuring the agreement, unless the dataset holds some out
     itself. In a recipe this is that of `[ground]`, whose training leaves these episodes out."""
+    inputs: tuple[str, ...] = Field(default=(), exclude_if=lambda names: not names)
+    """Columns that the target encoder reads in place of the state, such as "observation.features.front". It then also
+    estimates the abstract state, so that the policy runs without tracking."""
+
+    @field_validator("inputs")
+    @classmethod
+    def _are_observed(cls, inputs: tuple[str, ...]) -> tuple[str, ...]:
+        if wrong := [name for name in inputs if not name.startswith("observation.")]:
+            raise ValueError(f"expected columns of what is observed before the action, observation.…, got {wrong[0]}")
+        return tuple(dict.fromkeys(inputs))
 
 
 def align(
@@ -62,15 +74,29 @@ def align(
     made = origin(device)
     grounding_file = grounding / GROUNDING
     model = load_history_model(grounding_file, device)
-    episodes = PairedEpisodes.load(dataset, device)
+    episodes = PairedEpisodes.load(dataset, device, config.inputs)
     training, held_out = episodes.split(config.held_out_share, seed)
     torch.manual_seed(derive(seed, "alignment"))
     shape = model.shape
     alike = {name: getattr(shape, name) for name in ("embedding_size", "latent_size", "position_octaves", "encoder")}
+    abstract = training.steps(training.windows.state) if config.inputs else None
+    if abstract is not None:
+        source = open_dataset(dataset)
+        made_by = source.description["environment"].get(MADE_BY, {})
+        sensing = {
+            "inputs": {column.name: column.size for column in source.specs(config.inputs)},
+            "pictures": {name: made_by[name] for name in config.inputs if name in made_by},
+            "abstract_size": shape.state_size,
+            "unit_vectors": unit_vectors(abstract),
+        }
+        alike |= {"position_octaves": 0, "sensing": sensing}
     encoder = TargetEncoder(episodes.target_state.shape[-1], shape.goal_size, shape.action_size, **alike).to(device)
     # Where φ drops the robot's place, latents must not depend on where it came from.
     encoder.set_scales(
-        training.steps(training.target_state), training.steps(training.windows.goal), training.dropped_place
+        training.steps(training.target_state),
+        training.steps(training.windows.goal),
+        training.dropped_place,
+        abstract,
     )
     bandwidths = torch.tensor(_BANDWIDTHS, device=device) * shape.latent_size**0.5
     grounding_digest = file_digest(grounding_file)
@@ -84,18 +110,25 @@ def align(
             torch.manual_seed(derive(seed, f"alignment update {descent.done}"))
             windows, state = training.draw_windows(config.batch_windows, window)
             discrepancy, distance = _losses(model, encoder, windows, state, bandwidths)
-            descent.update(discrepancy + config.paired_weight * distance)
+            loss = discrepancy + config.paired_weight * distance
+            descent.update(loss + _estimate_error(encoder, windows, state).mean() if config.inputs else loss)
             if descent.done % _MEASURED_EVERY == 0 or descent.done == fitting.updates:
-                agreement = _agreement(model, encoder, held_out, bandwidths)
-                error = agreement["mmd"] + config.paired_weight * agreement["latent_rmse"] ** 2
-                descent.keep(error, **agreement)
+                measured = _agreement(model, encoder, held_out, bandwidths)
+                error = measured["mmd"] + config.paired_weight * measured["latent_rmse"] ** 2
+                descent.keep(error + measured.get("estimate_error", 0.0), **measured)
                 rate = descent.done * config.batch_windows / descent.stopwatch.seconds
-                note = f"{rate:,.0f} windows/s  paired latent RMSE {agreement['latent_rmse']:.3f}"
+                note = f"{rate:,.0f} windows/s  paired latent RMSE {measured['latent_rmse']:.3f}"
                 progress(descent.share, note)
         descent.finish()
-        agreement = _agreement(model, encoder, held_out, bandwidths)
+        agreement: dict[str, Any] = {**_agreement(model, encoder, held_out, bandwidths)}
         encoder.latent_r2.fill_(agreement["latent_r2"])
         save_target_encoder(folder / TARGET_ENCODER, encoder)
+        if config.inputs:
+            squared = _estimate_error(encoder, held_out.windows, held_out.target_state)
+            agreement |= {"estimate_rmse": (squared.sqrt() * encoder.abstract_std).tolist()}
+            encodes = "ψ^t" if encoder.is_deployed else "ψ^s on the estimated abstract state"
+            r2 = agreement["latent_r2"]
+            progress(1.0, f"ψ^t explains {r2:.2f} of the latents' variance: the policy runs with {encodes}")
         metrics: dict[str, Any] = made | {
             "windows_per_second": descent.done * config.batch_windows / descent.stopwatch.seconds,
             **descent.stopwatch.spent(),
@@ -129,4 +162,14 @@ def _agreement(
     latent, _ = model.encode(episodes.windows)
     variance = episodes.steps(latent).var(0, correction=0).mean()
     explained = 1.0 - distance / variance if variance > 0 else torch.zeros_like(distance)
-    return {"mmd": float(discrepancy), "latent_rmse": float(distance.sqrt()), "latent_r2": float(explained)}
+    found = {"mmd": float(discrepancy), "latent_rmse": float(distance.sqrt()), "latent_r2": float(explained)}
+    if encoder.inputs:
+        found["estimate_error"] = float(_estimate_error(encoder, episodes.windows, episodes.target_state).mean())
+    return found
+
+
+def _estimate_error(encoder: TargetEncoder, windows: PairedWindows, state: Tensor) -> Tensor:
+    """Return the mean squared error (X,) of the estimated φ(s_i), in units of its variance."""
+    _, memory = encoder.estimator.sequence(encoder.encoder_input(state, windows.goal, windows.previous_action))
+    squared = ((encoder.estimates(memory) - windows.state) / encoder.abstract_std).square()
+    return (squared * windows.mask.unsqueeze(-1)).sum((0, 1)) / windows.mask.sum()

@@ -175,9 +175,11 @@ def _policy(task: Task, loaded: PolicyFile | None, files: Mapping[str, Path], co
     headline: EncoderKind = "source"
     if "target_encoder" in files:
         encoder = load_target_encoder(files["target_encoder"])
-        aligned = replace(source, target_encoder=encoder)
-        robots["target"] = partial(started, aligned, aligned.act)
-        headline = config.encoder or ("target" if encoder.is_deployed else "source")
+        # A target shows states alone: what reads other inputs is tested on the robot.
+        if not encoder.inputs or (config.encoder == "target" and task.has_target):
+            aligned = replace(source, target_encoder=encoder)
+            robots["target"] = partial(started, aligned, aligned.act)
+            headline = config.encoder or ("target" if encoder.is_deployed else "source")
     facts: dict[str, Any] = {"policy": trained.policy.name} if isinstance(trained.policy, UserPolicy) else {}
     facts |= {"encoder": headline, "dataset_version": trained.dataset, "dataset_hash": trained.content_hash}
     simulators = {}

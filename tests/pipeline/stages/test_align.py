@@ -1,6 +1,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,14 +12,15 @@ from toy_episodes import no_episodes
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, silent
-from astra_data.dataset.columns import STATE
+from astra_data.dataset.columns import ABSTRACT_STATE, STATE, Column
 from astra_data.dataset.reader import Dataset
-from astra_data.grounding.alignment import TargetEncoder, gaussian_mmd
+from astra_data.dataset.versions import next_version
+from astra_data.grounding.alignment import TargetEncoder, gaussian_mmd, unit_vectors
 from astra_data.grounding.files import load_history_model, load_target_encoder, save_grounding
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.model import GroundingModel, GroundingShape
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.pipeline.stages.align import align
+from astra_data.pipeline.stages.align import AlignConfig, align
 
 
 def test_the_target_encoder_comes_closer_to_the_source(aligned: Path) -> None:
@@ -152,3 +154,83 @@ def test_the_encoder_is_as_large_as_the_source_and_sees_as_many_waves(paired: Pa
     align(config, dataset=paired, grounding=tmp_path, out=tmp_path / "out", progress=silent)
     sizes = load_target_encoder(tmp_path / "out/target_encoder.safetensors").sizes
     assert (sizes["latent_size"], sizes["embedding_size"], sizes["position_octaves"]) == (8, 24, 1)
+
+
+SEEN = "observation.features.front"
+
+
+@pytest.fixture(scope="module")
+def seen(paired: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The pairs, with φ of the states, twice as large, as features of a camera, beside one that says nothing."""
+    source, made_by = Dataset.open(paired), {SEEN: {"camera": "observation.images.front", "encoder": "eyes.py:EYES"}}
+    environment = source.description["environment"] | {"features": made_by}
+    options: dict[str, Any] = {"stage": "features", "config": {}, "out": tmp_path_factory.mktemp("seen") / "pairs"}
+    with next_version(source, "columns", more=[Column(SEEN, size=5)], environment=environment, **options) as writer:
+        for episode in source.episodes():
+            noise = np.random.default_rng(episode.uid).normal(size=(len(episode), 1))
+            values = np.concatenate([2 * episode.columns[ABSTRACT_STATE], noise], axis=1).astype(np.float32)
+            writer.add(replace(episode, columns={**episode.columns, SEEN: values}))
+    return writer.root
+
+
+def test_inputs_are_read_in_place_of_states_and_phi_is_estimated_from_them(
+    seen: Path, paired: Path, grounded: Path, tmp_path: Path
+) -> None:
+    config = ALIGN.model_copy(update={"inputs": (SEEN,)})
+    align(config, dataset=seen, grounding=grounded, seed=0, out=tmp_path / "out")
+    encoder = load_target_encoder(tmp_path / "out/target_encoder.safetensors")
+    assert encoder.inputs == {SEEN: 5} and encoder.pictures[SEEN]["encoder"] == "eyes.py:EYES"
+    windows = PairedEpisodes.load(paired).split(ALIGN.held_out_share, 0)[1].windows
+    noise = PairedEpisodes.load(seen, inputs=[SEEN]).split(ALIGN.held_out_share, 0)[1].target_state[..., 4:]
+    read = encoder.encoder_input(torch.cat([2 * windows.state, noise], -1), windows.goal, windows.previous_action)
+    apart = (encoder.estimates(encoder.estimator.sequence(read)[1]) - windows.state)[windows.mask.bool()]
+    metrics = json.loads((tmp_path / "out/metrics.json").read_text())
+    assert metrics["estimate_rmse"] == pytest.approx(apart.square().mean(0).sqrt().tolist(), rel=1e-3)
+    error = float((apart / encoder.abstract_std).square().mean())
+    assert metrics["estimate_error"] == pytest.approx(error, rel=1e-3) and error < 0.5  # after few updates
+    first = metrics["points"][0]
+    expected = first["mmd"] + first["latent_rmse"] ** 2 + first["estimate_error"]
+    assert first["held_out_error"] == pytest.approx(expected)
+
+
+def test_a_column_of_other_values_gives_another_encoder(seen: Path, grounded: Path, tmp_path: Path) -> None:
+    whole, both = PairedEpisodes.load(seen), PairedEpisodes.load(seen, inputs=[SEEN, STATE])
+    assert torch.equal(both.target_state[..., 5:], whole.target_state)
+    assert torch.equal(both.windows.state, whole.windows.state)
+    config, made = ALIGN.model_copy(update={"updates": 3, "inputs": (SEEN,)}), list[bytes]()
+    for order in ([0, 1, 2, 3, 4], [0, 1, 2, 3, 4], [1, 0, 2, 3, 4]):
+        with pytest.MonkeyPatch.context() as patch:
+            episodes = PairedEpisodes.load(seen, inputs=[SEEN])
+            other = replace(episodes, target_state=episodes.target_state[..., order])
+            patch.setattr(PairedEpisodes, "load", lambda *_, other=other: other)
+            align(config, dataset=seen, grounding=grounded, out=tmp_path / str(len(made)))
+        made.append((tmp_path / f"{len(made)}/target_encoder.safetensors").read_bytes())
+    assert made[0] == made[1] != made[2]
+
+
+def test_estimated_vectors_of_length_1_have_it() -> None:
+    angle = torch.linspace(0, 6, 50)
+    abstract = torch.stack([angle, angle.cos(), angle.sin(), angle + 1, 0.9 * angle.cos()], dim=1)
+    turn = torch.nn.functional.normalize(torch.randn(50, 4), dim=1)
+    assert unit_vectors(abstract) == [(1, 3)] and unit_vectors(torch.cat([abstract[:, :1], turn], 1)) == [(1, 5)]
+    sensing = {"inputs": {"observation.a": 3}, "pictures": {}, "abstract_size": 5, "unit_vectors": [(1, 3)]}
+    encoder = TargetEncoder(3, 0, 1, embedding_size=4, latent_size=4, sensing=sensing)
+    encoder.set_scales(torch.randn(50, 3), torch.empty(50, 0), abstract=abstract)
+    memory = torch.randn(7, 4)
+    expected = abstract.mean(0) + abstract.std(0) * encoder.estimate_head(encoder.estimator.latent(memory))
+    expected[:, 1:3] /= expected[:, 1:3].norm(dim=1, keepdim=True)
+    torch.testing.assert_close(encoder.estimates(memory), expected)
+
+
+@pytest.mark.parametrize(
+    ("inputs", "message"),
+    [
+        (["observation.joints"], "has no column observation.joints; it has"),
+        (["next.reward"], "expected columns of what is observed before the action, observation.…, got next.reward"),
+    ],
+)
+def test_inputs_that_are_not_there_or_not_observed_are_refused(
+    inputs: list[str], message: str, seen: Path, grounded: Path, tmp_path: Path
+) -> None:
+    with pytest.raises((BadInputError, ValueError), match=message):
+        align(AlignConfig(inputs=tuple(inputs)), dataset=seen, grounding=grounded, out=tmp_path / "out")
