@@ -321,7 +321,7 @@ def _trial_blocks(judged: Judgment, trials: TrialsFile) -> list[Text | TableBloc
     else:
         state = f"Not finished: run the same command again. {advice(judged, trials)}"
     size = f" at {trials.percent} %" if trials.percent else ""
-    told = " that predictions of the same trials make narrower (control variate)" if trials.by_hand else ""
+    narrower = " that predictions of the same trials make narrower (control variate)" if trials.by_hand else ""
     return [
         Text(
             f"{state} {trials.spent} of {trials.trials} episodes were used, on the {trials.field} candidates "
@@ -332,6 +332,6 @@ def _trial_blocks(judged: Judgment, trials: TrialsFile) -> list[Text | TableBloc
             "Trials are split equally over rounds, and within a round over its candidates, which get the same starts "
             "and goals. After each round, the better half goes on. Mean: mean success over all trials of a candidate "
             f"so far, with the judges' lower quartile as a prior worth {trials.pseudo_trials} trials. Success: rate "
-            f"over the same trials, with Wilson's interval{told}."
+            f"over the same trials, with Wilson's interval{narrower}."
         ),
     ]
