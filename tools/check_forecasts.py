@@ -11,7 +11,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from astra_data.core.arrays import Ints
 from astra_data.dataset.versions import open_dataset
 from astra_data.grounding import diagnosis
 from astra_data.robots.registry import pairing_named
@@ -22,13 +21,8 @@ def main(dataset: str, simulator: str) -> None:
     source, pairing = open_dataset(dataset), pairing_named(simulator)
     log = diagnosis._Log.of(source)
     every = diagnosis._Error.of(log, diagnosis._Felt.of(log, pairing, source.info["fps"]))
-    count, rng, variance = int(every.recording.max()) + 1, np.random.default_rng(1), every.error.var(axis=0)
+    count, rng = int(every.recording.max()) + 1, np.random.default_rng(1)
     print(f"{source.reference}: {count} recordings are long enough")
-
-    def left(recordings: Ints, tested: Ints) -> float:
-        rows, out = (np.isin(every.recording, those) for those in (recordings, tested))
-        wrong = every.left([every.present, every.commands, every.past], rows, out)
-        return float(np.minimum(1.0, (wrong**2).mean(axis=0) / variance).mean())
 
     for size in (10, 20, 40, 80):
         if 1.5 * size > 0.8 * count:
@@ -48,8 +42,8 @@ def main(dataset: str, simulator: str) -> None:
             )
             forecasts.append(diagnosis._forecast(some))
             tested = order[int(0.8 * count) :]
-            actual.append(left(order[: forecasts[-1].more], tested))
-            before.append(left(order[:size], tested))
+            actual.append(every.share_left(order[: forecasts[-1].more], tested))
+            before.append(every.share_left(order[:size], tested))
         ends = [one.expected for one in forecasts]
         inside = sum(low <= value <= high for (_, low, high), value in zip(ends, actual, strict=True))
         apart = [abs(value - then) / value for (then, _, _), value in zip(ends, actual, strict=True)]

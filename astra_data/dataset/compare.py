@@ -6,9 +6,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from astra_data.core.arrays import Ints
 from astra_data.core.errors import CorruptDatasetError
 from astra_data.core.naming import RECORD, printable, shortened
 from astra_data.dataset.columns import Column
@@ -132,13 +129,6 @@ def lineage(dataset: Dataset) -> Ancestors:
 def hashes(ancestors: Ancestors) -> set[str]:
     """Return the content hashes of a dataset and of all its ancestors."""
     return {content_hash for *_, content_hash in ancestors}
-
-
-def recordings_of(dataset: Dataset) -> Ints:
-    """Return the number of the recording that each episode is, or is a copy of, (E,), from 0 on."""
-    sources, numbers = dataset.metadata.get("source_episode", [None] * len(dataset)), dict[int, int]()
-    recorded = (uid if source is None else source for uid, source in zip(dataset.uids, sources, strict=True))
-    return np.array([numbers.setdefault(int(uid), len(numbers)) for uid in recorded])
 
 
 def tree_lines(ancestors: Ancestors) -> Iterator[str]:

@@ -12,7 +12,7 @@ from astra_data.core.config import did_you_mean, only_given
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import first_few
 from astra_data.dataset.columns import Scalar, distinct_uids, renamed_metadata
-from astra_data.dataset.compare import recordings_of, schema_differences, world_differences
+from astra_data.dataset.compare import schema_differences, world_differences
 from astra_data.dataset.description import permutation
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import next_version
@@ -71,13 +71,12 @@ def subset(
         )
     chosen = source.subset_seed if seed is None else seed
     config: dict[str, Any] = {"episodes": count, "percent": percent, "of": of, "seed": chosen}
-    order = permutation(source.uids.tolist(), chosen)
-    recording, first = dict(zip(source.uids.tolist(), recordings_of(source).tolist(), strict=True)), dict[int, int]()
-    order.sort(key=lambda uid: first.setdefault(recording[uid], len(first)))
+    taken = set(source.uids[source.subset(count, chosen)].tolist())
     if stratify:
         order, strata = _stratified(source, stratify, chosen)
+        taken = set(order[:count])
         config |= {"stratify": stratify, "strata": strata}
-    return _write(source, set(order[:count]), stage="subset", config=config, name=name, out=out, seed=chosen)
+    return _write(source, taken, stage="subset", config=config, name=name, out=out, seed=chosen)
 
 
 def share(percent: int, episodes: int) -> int:

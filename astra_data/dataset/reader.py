@@ -179,11 +179,26 @@ class Dataset:
             return [bool(episode.columns[SUCCESS].any()) for episode in self.episodes([SUCCESS])]
         return None if set(known) == {None} else known
 
-    def subset(self, count: int) -> list[int]:
-        """Return `count` episode indices; smaller subsets are prefixes of larger ones."""
+    @cached_property
+    def recordings(self) -> Ints:
+        """The number of the recording that each episode is, or is a copy of, (E,), from 0 on."""
+        sources, numbers = self.metadata.get("source_episode", [None] * len(self)), dict[int, int]()
+        recorded = (uid if source is None else source for uid, source in zip(self.uids, sources, strict=True))
+        return np.array([numbers.setdefault(int(uid), len(numbers)) for uid in recorded])
+
+    def subset(self, count: int, seed: int | None = None) -> list[int]:
+        """Return `count` episode indices; smaller subsets are prefixes of larger ones.
+
+        Copies of a recording, as `augment` makes them, follow each other. The order is that of `seed`, by default the
+        stored one.
+        """
         if not 1 <= count <= len(self):
             raise BadInputError(f"{self.reference}: a subset of {count} episodes, expected 1 to {len(self)}.")
-        return self.order[:count]
+        position, order = {int(uid): index for index, uid in enumerate(self.uids)}, self.order
+        if seed is not None:
+            order = [position[uid] for uid in described.permutation(position, seed)]
+        rank = {recording: place for place, recording in reversed([*enumerate(self.recordings[order].tolist())])}
+        return sorted(order, key=lambda index: rank[int(self.recordings[index])])[:count]
 
     def statistics(self) -> dict[str, dict[str, Any]]:
         """Return meta/stats.json, column to statistic to values; of a recording, min, max and mean."""

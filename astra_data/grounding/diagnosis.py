@@ -11,7 +11,6 @@ from astra_data.core.arrays import Bools, Floats, Ints, as_rows
 from astra_data.core.errors import BadInputError
 from astra_data.dataset import columns as keys
 from astra_data.dataset.checkup import Finding
-from astra_data.dataset.compare import recordings_of
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import open_dataset
 from astra_data.robots.registry import Pairing, built, pairing_named
@@ -163,7 +162,7 @@ class _Log:
         lengths = source.lengths
         step = np.concatenate([np.arange(length) for length in lengths])
         state, target_state, action, landed, next_state = (as_rows(columns[name]).astype(np.float64) for name in names)
-        recording = np.repeat(recordings_of(source), lengths)
+        recording = np.repeat(source.recordings, lengths)
         return cls(state, target_state, action, landed, next_state, step, recording)
 
     @property
@@ -337,10 +336,19 @@ class _Error:
             left[:, index] = self.error[out, index] - features[out] @ weights
         return left
 
+    def share_left(self, recordings: Ints, tested: Ints) -> float:
+        """Return the share of the error's variance that histories leave of `tested`, fitted to `recordings`.
+
+        A mean over the values, of which each is at most 1.
+        """
+        out, sets = np.isin(self.recording, tested), [self.present, self.commands, self.past]
+        wrong = self.left(sets, np.isin(self.recording, recordings), out)
+        return float(np.minimum(1.0, (wrong**2).mean(axis=0) / self.error.var(axis=0)).mean())
+
 
 def _explained(log: _Log, known: _Error, values: Sequence[str]) -> tuple[dict[str, Floats], list[str]]:
     """Return R² by what predicts the error, and those of the recorded `values` that show what histories leave of it."""
-    steps = f"{min(_PAST_STEPS, known.past.shape[1])} steps before"
+    steps = f"{_PAST_STEPS} steps before"
     recorded = np.concatenate([log.target_state, log.action], axis=1)[known.rows]
     sets = {
         "the present abstract state and command": [known.present],
@@ -377,17 +385,14 @@ def _products(values: Floats) -> Floats:
 
 
 def _forecast(known: _Error) -> Forecast:
-    sets, variance = [known.present, known.commands, known.past], known.error.var(axis=0)
     count, rng = int(known.recording.max()) + 1, np.random.default_rng(0)
     fitted = count - max(1, count // 5)
     sizes = tuple(sorted({max(2, round(fitted * share)) for share in (0.35, 0.5, 0.7, 1.0)}))
     left = np.empty((len(sizes), _FORECASTS))
     for refit in range(_FORECASTS):
         order = rng.permutation(count)
-        out = np.isin(known.recording, order[fitted:])
         for number, size in enumerate(sizes):
-            wrong = known.left(sets, np.isin(known.recording, order[:size]), out)
-            left[number, refit] = float(np.minimum(1.0, (wrong**2).mean(axis=0) / variance).mean())
+            left[number, refit] = known.share_left(order[:size], order[fitted:])
     return _extrapolated(sizes, left, round(1.5 * count))
 
 

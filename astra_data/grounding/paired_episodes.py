@@ -14,7 +14,6 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import held_out_episodes
 from astra_data.dataset import columns as names
 from astra_data.dataset.columns import Array
-from astra_data.dataset.compare import recordings_of
 from astra_data.dataset.inspection import stands_still
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import open_dataset
@@ -106,7 +105,7 @@ class PairedEpisodes:
         known = {names.GOAL, names.REWARD, names.SUCCESS} & dataset.features.keys()
         columns = dataset.columns(list(dict.fromkeys([*_COLUMNS, *known, *inputs])))
         lengths, held_out = dataset.lengths, np.array(dataset.metadata.get("held_out", ()), dtype=bool)
-        uids, recordings = dataset.uids, recordings_of(dataset)
+        uids, recordings = dataset.uids, dataset.recordings
         if (made_up := _made_up(dataset, columns)).any():
             columns, lengths = _merged(columns, lengths, made_up)
             left = lengths > 0

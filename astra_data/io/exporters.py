@@ -15,7 +15,6 @@ from astra_data.core.config import did_you_mean
 from astra_data.core.durable import hidden_folder, publish, refuse_existing
 from astra_data.core.errors import BadInputError, optional
 from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED, Array, Episode
-from astra_data.dataset.compare import recordings_of
 from astra_data.dataset.reader import Dataset
 from astra_data.io.hdf5_file import D3RLPY, D4RL, MINARI, ROBOMIMIC
 
@@ -106,7 +105,7 @@ def _robomimic(dataset: Dataset, path: Path, out: Path) -> None:
 
 def _validation(dataset: Dataset) -> Bools:
     """Return which episodes (E,) are for validation; copies go where their recording goes."""
-    recordings = recordings_of(dataset)
+    recordings = dataset.recordings
     held_out = np.array(dataset.metadata.get("held_out", [False] * len(dataset)), dtype=bool)
     if held_out.any():
         return np.isin(recordings, recordings[held_out])

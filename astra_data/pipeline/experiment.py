@@ -21,7 +21,7 @@ from astra_data.core.durable import begun_beside, write_file
 from astra_data.core.errors import AstraDataError, BadInputError, RecipeError
 from astra_data.core.naming import first_few, shortened, stage_of_key
 from astra_data.dataset.columns import ABSTRACT_STATE, ACTION
-from astra_data.dataset.compare import hashes, lineage, recordings_of
+from astra_data.dataset.compare import hashes, lineage
 from astra_data.dataset.description import changed_values, read_description
 from astra_data.dataset.edit import share
 from astra_data.dataset.reader import Dataset
@@ -372,7 +372,7 @@ def data_condition(recipe: Recipe) -> Condition | None:
     source.specs(recipe.align.inputs)
     grounds = any(method_named(row).grounds for row in recipe.methods)
     if grounds and not any(source.metadata.get("held_out", ())):
-        name, recordings = source.reference, len(set(recordings_of(source)))
+        name, recordings = source.reference, len(set(source.recordings))
         if recipe.sweep.percent:
             smallest = min(recipe.sweep.percent)
             name, recordings = f"{smallest} % of {name}", min(recordings, share(smallest, len(source)))

@@ -123,8 +123,13 @@ def choose_by_trials(
         of = f"of the {len(candidates)} that were judged, got {asked}"
         raise BadInputError(f"expected two candidates or more to try, {of}: give another --field, or more rows")
     field = field or choice.widest_field(len(candidates), trials)
-    begun = choice.TrialsFile(trials=trials, field=field, percent=percent, pseudo_trials=choice.PSEUDO_TRIALS)
-    begun = begun.model_copy(update={"by_hand": by_hand is not None})
+    begun = choice.TrialsFile(
+        trials=trials,
+        field=field,
+        percent=percent,
+        by_hand=by_hand is not None,
+        pseudo_trials=choice.PSEUDO_TRIALS,
+    )
     path = folder / choice.FOLDER / choice.TRIALS
     if there := choice.read_trials(path):
         for name, now in begun.model_dump(include={"trials", "field", "percent", "by_hand", "pseudo_trials"}).items():

@@ -5,6 +5,7 @@ import numpy as np
 from astra_data.core.arrays import Floats
 from astra_data.grounding.diagnosis import Diagnosis, with_ends
 from astra_data.reports.blocks import Section, TableBlock, Text, code, markdown
+from astra_data.reports.statistics import Estimate, interval
 
 DIAGNOSIS = "diagnosis.md"
 _BARS = " ▁▂▃▄▅▆▇█"
@@ -73,8 +74,8 @@ def diagnosis_page(recipe: str, found: Diagnosis, timestep_s: float) -> str:
 
 
 def _with_ends(values: tuple[float, float, float], digits: int = 3) -> str:
-    value, low, high = (f"{round(value, digits) + 0.0:.{digits}f}" for value in values)  # never -0.00
-    return f"{value} [{low}, {high}]"
+    value, low, high = (round(value, digits) + 0.0 for value in values)  # never -0.00
+    return interval(Estimate(value, low, high), digits)
 
 
 def _bars(weights: Floats) -> str:

@@ -14,7 +14,6 @@ from astra_data.dataset.compare import (
     hashes,
     lineage,
     names_apart,
-    recordings_of,
     tree_lines,
 )
 from astra_data.dataset.edit import delete, merge, subset
@@ -110,8 +109,8 @@ def test_copies_are_counted_as_the_recording_that_they_are_of(tmp_path: Path) ->
     with writer(tmp_path / "set") as open_writer:
         for uid, source in sources.items():
             open_writer.add(Episode(uid, columns, {} if source is None else {"source_episode": source}))
-    assert recordings_of(Dataset.open(tmp_path / "set")).tolist() == [0, 0, 0, 1, 1]
-    assert recordings_of(write_fake(tmp_path / "plain")).tolist() == [0, 1, 2, 3, 4]
+    assert Dataset.open(tmp_path / "set").recordings.tolist() == [0, 0, 0, 1, 1]
+    assert write_fake(tmp_path / "plain").recordings.tolist() == [0, 1, 2, 3, 4]
 
 
 def test_of_a_thousand_merges_of_two_filters_each_is_told_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

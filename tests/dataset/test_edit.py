@@ -88,6 +88,7 @@ def test_copies_of_a_recording_go_together(tmp_path: Path) -> None:
         found = uids(subset(source, episodes=episodes, out=tmp_path / f"{episodes}"))
         assert taken < found and len({uid % 10 for uid in found}) == -(-episodes // 6)
         taken = found
+        assert {int(uid) for uid in source.uids[source.subset(episodes)]} == found
     again = uids(subset(Dataset.open(tmp_path / "36"), episodes=14, out=tmp_path / "again"))
     assert again == uids(tmp_path / "14")
 
