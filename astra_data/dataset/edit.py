@@ -1,7 +1,7 @@
 """New versions of a dataset with other episodes: subset, delete, filter and merge; nothing is edited in place."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -32,6 +32,7 @@ def subset(
     of: int | None = None,
     seed: int | None = None,
     stratify: str | None = None,
+    always: Collection[int] = (),
     name: str | None = None,
     out: Path | None = None,
 ) -> Path:
@@ -46,6 +47,7 @@ def subset(
         of: a number of episodes, by default all.
         seed: of the permutation whose first episodes are taken, by default that of `source`.
         stratify: a key of the episodes' metadata; each of its values keeps its share.
+        always: uids of episodes that every subset has; numbers and shares are of the others.
         name: of the new dataset; by default it is the next version of `source`.
         out: its folder, by default under `versions.home()`.
 
@@ -61,22 +63,23 @@ def subset(
     """
     if (episodes is None) == (percent is None) or (of is not None and percent is None):
         raise BadInputError("a subset needs either a number of episodes or a percentage (optionally with --of)")
-    count = episodes if percent is None else share(percent, of or len(source))
+    available = len(source) - len(always)
+    count = episodes if percent is None else share(percent, of or available)
     assert count is not None
-    if not 1 <= count <= len(source):
-        wanted = f"{count} episodes" if percent is None else f"{percent} % of {of or len(source)} = {count}"
+    if not 1 <= count <= available:
+        wanted = f"{count} episodes" if percent is None else f"{percent} % of {of or available} = {count}"
         raise BadInputError(
-            f"{source.reference} has {len(source)} episodes, but the subset has {wanted}: expected 1 "
-            f"to {len(source)}. Episodes are never repeated: collect or augment more, or give a smaller --of."
+            f"{source.reference} has {available} episodes, but the subset has {wanted}: expected 1 "
+            f"to {available}. Episodes are never repeated: collect or augment more, or give a smaller --of."
         )
     chosen = source.subset_seed if seed is None else seed
     config: dict[str, Any] = {"episodes": count, "percent": percent, "of": of, "seed": chosen}
-    taken = set(source.uids[source.subset(count, chosen)].tolist())
+    order = source.uids[source.subset(len(source), chosen)].tolist()
     if stratify:
         order, strata = _stratified(source, stratify, chosen)
-        taken = set(order[:count])
         config |= {"stratify": stratify, "strata": strata}
-    return _write(source, taken, stage="subset", config=config, name=name, out=out, seed=chosen)
+    taken = [uid for uid in order if uid not in always][:count]
+    return _write(source, {*always, *taken}, stage="subset", config=config, name=name, out=out, seed=chosen)
 
 
 def share(percent: int, episodes: int) -> int:

@@ -102,8 +102,8 @@ def gap_blocks(results: Results) -> Iterator[Block]:
     if results.is_swept:
         yield Text("How much data is enough:", [*_sufficient_sizes(results, means, quantities, horizons)])
         yield Text(
-            "Each size holds out a share of its own episodes, so smaller sizes are measured on fewer of "
-            "them: compare with the line without grounding of the same size."
+            "Unless the dataset marks episodes as held out, each size holds out a share of its own, so smaller sizes "
+            "are measured on fewer of them: compare with the line without grounding of the same size."
         )
     rows = results.groundings()
     found = {title: [results.summary(row, name, "ground") for row in rows] for name, title in _FITS.items()}

@@ -96,6 +96,15 @@ def test_a_delta_action_finds_what_was_added_to_the_commands(tmp_path: Path, sim
     added, _ = grounding.delta(windows.state, windows.action)
     # 0.5 m/s of a range of 5 m/s, which is 2 of the action's units.
     torch.testing.assert_close(added, torch.full((8, 20, 1), 0.2), atol=0.07, rtol=0)
+    # A replay that begins within an episode remembers what was before.
+    before = grounding.hidden_before(windows, every=6)
+    assert before.shape == (8, 4, 32) and not before[:, 0].any()
+    remembering = grounding.simulator(task, 8)
+    remembering.start(windows.state[:, 6], torch.arange(8), torch.zeros(8, 1), hidden=before[:, 1])
+    after = remembering.step(windows.action[:, 6])
+    commands = task.limits.in_units(windows.action + added)
+    torch.testing.assert_close(after, (windows.state + 0.1 * commands)[:, 6])
+    assert not torch.allclose(added[:, 6], grounding.delta(windows.state[:, 6:7], windows.action[:, 6:7])[0][:, 0])
 
 
 def test_each_member_of_an_ensemble_learns_the_correction_and_an_episode_keeps_its_member(tmp_path: Path) -> None:

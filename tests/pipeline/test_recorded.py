@@ -63,6 +63,11 @@ def test_ridge_learns_what_recorded_joints_do(
     joints.write_steps(joints.ANYMAL, source, states=joints.states, stretches=joints.stretches, rows=4)
     steps = Dataset.open(tmp_path / "home/pace-joints-steps/data-1.0.0")
     assert steps.info["fps"] == 100
+    # Shifted copies of a stretch follow each other in every subset, and what is held out has none.
+    recordings = steps.recordings[steps.subset(len(steps))]
+    assert (np.diff(recordings) != 0).sum() == len(set(recordings)) - 1
+    assert 4 * (~np.array(steps.metadata["held_out"])).sum() >= len(steps) > len(set(recordings))
+    assert {1, 4} == {int(one) for one in np.bincount(recordings)}
     first = next(iter(steps.episodes())).columns
     np.testing.assert_allclose(first["observation.state"][1:], first["next.observation.state"][:-1])
     # The first state is that after the first step of four rows, its action the mean of the next four.

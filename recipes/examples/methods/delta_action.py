@@ -42,9 +42,9 @@ class DeltaSimulator(EpisodeSimulator):
         self.delta, count = delta, len(simulator.state)
         self.hidden = torch.zeros(1, count, delta.sizes[2], device=simulator.state.device)
 
-    def start(self, state, rows, goal, **history):
+    def start(self, state, rows, goal, *, hidden=None, previous_action=None):
         super().start(state, rows, goal)
-        self.hidden[:, rows] = 0.0
+        self.hidden[:, rows] = 0.0 if hidden is None else hidden
 
     @torch.no_grad()
     def step(self, action):
@@ -62,11 +62,21 @@ class DeltaSimulator(EpisodeSimulator):
 @dataclass(frozen=True)
 class DeltaAction(FittedGrounding):
     kind = "delta action"
+    start_stride = 10  # the memories before each recorded step would take 13 MB for 100 k steps
 
     delta: Delta
 
     def corrected(self, simulator):
         return DeltaSimulator(simulator, self.delta)
+
+    @torch.no_grad()
+    def hidden_before(self, windows, every=1):
+        hidden, before = windows.state.new_zeros(1, len(windows.state), self.delta.sizes[2]), []
+        for first in range(0, windows.state.shape[1], every):
+            before.append(hidden[0])
+            given = (one[:, first : first + every] for one in (windows.state, windows.action))
+            hidden = self.delta(*given, hidden)[1]
+        return torch.stack(before, dim=1)
 
     def to_file(self):
         return self.delta.state_dict(), {"sizes": self.delta.sizes}

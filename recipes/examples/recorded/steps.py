@@ -55,7 +55,9 @@ def write_steps(task, source, test=None, *, states, stretches, rows, share=0.25)
                         each = action[begin + rows : begin + steps * rows].reshape(steps - 1, rows, -1)
                         values = {"observation.state": ends[:-1], "action": each.mean(1).astype(np.float32)}
                         values["next.observation.state"] = ends[1:]
-                        metadata = {"held_out": bool(held_out), "source_episode": int(episode.uid)}
+                        metadata = {"held_out": bool(held_out)}
+                        if begin > first:  # a copy, so that subsets take whole stretches
+                            metadata["source_episode"] = count - (begin - first)
                         writer.add(Episode(count, values, metadata))
                         count += 1
     print(f"{root}: {count} episodes")

@@ -1,8 +1,9 @@
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
-from fake_dataset import write_fake
+from fake_dataset import fake_episodes, write_fake, writer
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import silent
@@ -36,3 +37,19 @@ def test_how_many_there_are_of_how_many_is_told(tmp_path: Path) -> None:
         given: dict[str, Any] = {"percent": 100, "of": of, "out": tmp_path / f"{of}"}
         subset(tmp_path / "pair", **given, progress=lambda _, note: notes.append(note))
     assert notes == ["5 of 5 episodes", "4 of 5 episodes", "2 of 5 episodes"]
+
+
+def test_episodes_that_are_marked_as_held_out_are_in_every_size_and_no_part_of_it(tmp_path: Path) -> None:
+    with writer(tmp_path / "pair") as open_writer:
+        for index, episode in enumerate(fake_episodes()):
+            open_writer.add(replace(episode, metadata={"held_out": index in (1, 3)}))
+    held_out = set(Dataset.open(tmp_path / "pair").uids[[1, 3]].tolist())
+    notes = list[str]()
+    for percent, others in ((34, 1), (100, 3)):
+        out = tmp_path / str(percent)
+        subset(tmp_path / "pair", percent=percent, out=out, progress=lambda _, note: notes.append(note))
+        uids = set(Dataset.open(out).uids.tolist())
+        assert held_out < uids and len(uids) == 2 + others
+    assert notes == ["1 of 3 episodes", "3 of 3 episodes"]
+    with pytest.raises(BadInputError, match="has 3 episodes, but the subset has 134 % of 3 = 4: expected 1 to 3"):
+        subset(tmp_path / "pair", percent=134, out=tmp_path / "out", progress=silent)
