@@ -9,6 +9,7 @@ import torch
 
 from astra_data.core.arrays import Bools, Floats, Ints, as_rows
 from astra_data.core.errors import BadInputError
+from astra_data.core.progress import Progress, silent
 from astra_data.dataset import columns as keys
 from astra_data.dataset.checkup import Finding
 from astra_data.dataset.reader import Dataset
@@ -91,12 +92,13 @@ class Diagnosis:
     findings: tuple[Finding, ...]
 
 
-def diagnose(dataset: str | Path, simulator: str) -> Diagnosis:
+def diagnose(dataset: str | Path, simulator: str, progress: Progress = silent) -> Diagnosis:
     """Look at a paired dataset and its abstract simulator before anything is fitted.
 
     Args:
         dataset: a paired dataset, by name or folder.
         simulator: as `pair` takes it; a file of the user's is run.
+        progress: called as the simulator steps, which takes the time.
 
     Raises:
         BadInputError: the dataset has not been paired, or has no two steps in a row.
@@ -108,7 +110,7 @@ def diagnose(dataset: str | Path, simulator: str) -> Diagnosis:
     labels = {column.name: column.labels for column in source.schema}
     names = labels[keys.ACTION]
     commands = _commands(log, names, pairing.commands)
-    felt = _Felt.of(log, pairing, source.info["fps"])
+    felt = _Felt.of(log, pairing, source.info["fps"], progress)
     responses = _responses(log, felt, names, source.info["fps"])
     missed = _missed(log, pairing)
     recordings, known = len(np.unique(log.recording)), _Error.of(log, felt)
@@ -188,7 +190,7 @@ class _Felt:
     best_shift: int
 
     @classmethod
-    def of(cls, log: _Log, pairing: Pairing, fps: float) -> "_Felt":
+    def of(cls, log: _Log, pairing: Pairing, fps: float, progress: Progress) -> "_Felt":
         lengths = log.step[np.flatnonzero(np.diff(log.step, append=0) <= 0)] + 1
         lags = max(1, min(LONGEST_STEPS, int(LONGEST_S * fps), int(np.median(lengths)) // 2))
         rows, size = np.flatnonzero(log.step >= lags), log.action.shape[1]
@@ -204,6 +206,7 @@ class _Felt:
         scale, errors = np.where(used, scale, 1.0), []
         changes = np.empty((len(rows), size, lags + 1, len(scale)))
         for lag in range(lags + 1):
+            progress(lag / (lags + 1), f"{len(rows) * (1 + lag * (size + 1)):,} steps of the simulator")
             past = log.action[rows - lag]
             apart = (_moved(simulators, log.state[rows], past) - log.next_state[rows]) / scale
             errors.append(float((apart[:, used] ** 2).sum()))

@@ -19,7 +19,7 @@ from astra_data.core.errors import BadInputError, MissingStageError, optional
 from astra_data.core.naming import RECORD, RUNS, artifact_key, reference_of, row_of_key, stage_of_key
 from astra_data.grounding.diagnosis import diagnose
 from astra_data.methods import grounded_as, method_named
-from astra_data.pipeline.display import display
+from astra_data.pipeline.display import display, shown
 from astra_data.pipeline.executors import EXECUTORS, Item
 from astra_data.pipeline.experiment import (
     ALWAYS_NEW,
@@ -123,7 +123,8 @@ def write_diagnosis(experiment: Experiment, part: Selection) -> None:
     recipe, paired = experiment.recipe, experiment.folder / artifact_key("pair", "", part.seeds[0])
     if paired.is_dir():
         try:
-            found = diagnose(paired, recipe.task)
+            with shown("diagnosis") as progress:
+                found = diagnose(paired, recipe.task, progress)
         except BadInputError as error:  # no reason to fail: the pairs are made
             _log.warning("%s is not written: %s", DIAGNOSIS, error)
             return

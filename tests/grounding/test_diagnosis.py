@@ -163,6 +163,15 @@ def test_a_command_that_the_simulator_ignores_is_named(tmp_path: Path) -> None:
     assert x.error < 1e-6 and not x.where and y.error == pytest.approx(0.1 * 0.5 / np.sqrt(3), rel=0.1)
 
 
+def test_how_far_it_is_is_told(tmp_path: Path) -> None:
+    found, notes = recorded(tmp_path, lag_s=0.2), list[tuple[float, str]]()
+    diagnose(tmp_path / "pairs", f"{tmp_path / 'axes.py'}:Axes", lambda *note: notes.append(note))
+    lags = len(found.responses[0].weights) - 1
+    steps = 12 * (150 - lags)
+    expected = [(lag / (lags + 1), f"{steps * (1 + 3 * lag):,} steps of the simulator") for lag in range(lags + 1)]
+    assert lags > 1 and notes == expected
+
+
 def test_commands_that_only_vary_together_are_warned_of(tmp_path: Path) -> None:
     assert any(line.what == "pull and push only ever vary together" for line in recorded(tmp_path, same=True).findings)
 

@@ -96,3 +96,9 @@ def test_a_window_remembers_as_it_does_step_by_step(recorded: dict[str, Any]) ->
     assert not before[:, 0].any()
     last = torch.cat([state[:, 1:6, :2], action[:, 1:6]], dim=-1).flatten(1)
     torch.testing.assert_close(before[:, 6], last)
+
+
+def test_seconds_in_which_joints_stand_still_are_left_out(recorded: dict[str, Any]) -> None:
+    state = np.zeros((41, 12))
+    state[13:17, 3], state[25, 7] = 0.06, 0.04
+    assert list(recorded["joints"].stretches(state, 10)) == [(10, 20)]

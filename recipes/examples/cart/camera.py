@@ -2,7 +2,7 @@
 
 python camera.py FOLDER [drives]      records drives by random commands with lerobot, with a video
 python camera.py play RUN [trials]    sends the cart to its dock by what the camera sees, and counts
-python camera.py compare RUN OUT      seeds 300 to 304 of cart_table.toml, by pictures and by states
+python camera.py compare RUN OUT      the same by pictures and by states, with either encoder
 """
 
 import sys
@@ -14,15 +14,13 @@ import torch
 from cart import DOCK_M, TASK
 from robot import TrueCart
 
-from astra_data import Column, Dataset, align, load_policy
-from astra_data.dataset.versions import next_version
-from astra_data.grounding.features import DEFAULT, encoded
+from astra_data import align, load_policy
 from astra_data.grounding.files import TARGET_ENCODER, load_target_encoder
 from astra_data.pipeline.stages.align import AlignConfig
 
 PIXELS, LEFT_M, BOTTOM_M, WIDTH_M = 64, -2.5, -4.0, 8.0
 FLOOR, DOCK, BODY, NOSE, LOAD = (90, 90, 90), (40, 160, 60), (40, 70, 200), (220, 50, 40), (240, 220, 60)
-CAMERA, FEATURES = "observation.images.top", "observation.features.top"
+CAMERA = "observation.images.top"
 
 
 def photograph(states):
@@ -97,33 +95,20 @@ def play(run, trials=100):
         print(f"{row}, seed {seed}: {deliver(load_policy(run, row, seed=seed), seen, trials)}")
 
 
-def compare(run, out, seeds=range(300, 305)):
-    """Print how policies of `run` do by pictures, with either encoder, and by states; encoders go to `out`."""
-    for seed in seeds:
-        pairs, aligned = Path(out) / f"pair/seed_{seed}", Path(out) / f"align/seed_{seed}"
+def compare(run, out):
+    """Print how policies of a run do by pictures and by states, with either encoder; ψ^t of states goes to `out`."""
+    for seen_by in sorted((Path(run) / "align/astra").glob("seed_*")):
+        seed, aligned = int(seen_by.name.removeprefix("seed_")), Path(out) / seen_by.name
         if not aligned.exists():
-            source = Dataset.open(Path(run) / f"pair/seed_{seed}")
-            column, made_by = Column(FEATURES, size=64), {FEATURES: {"camera": CAMERA, "encoder": DEFAULT}}
-            described = {"environment": {"features": made_by}, "config": {}, "out": pairs}
-            with next_version(source, "columns", more=[column], stage="features", **described) as writer:
-                for episode in source.episodes():
-                    features = encoded(photograph(episode.columns["observation.state"]), DEFAULT)
-                    writer.add(replace(episode, columns={**episode.columns, FEATURES: features}))
-            align(
-                AlignConfig(inputs=(FEATURES,)),
-                dataset=pairs,
-                grounding=Path(run) / f"ground/astra/seed_{seed}",
-                seed=seed,
-                out=aligned,
-            )
-        camera = load_target_encoder(aligned / TARGET_ENCODER)
+            pairs, grounding = Path(run) / f"pair/{seen_by.name}", Path(run) / f"ground/astra/{seen_by.name}"
+            align(AlignConfig(), dataset=pairs, grounding=grounding, seed=seed, out=aligned)
+        camera, tracking = (load_target_encoder(folder / TARGET_ENCODER) for folder in (seen_by, aligned))
         for row in ("astra_plus", "astra"):
-            states = replace(load_policy(run, row, seed=seed), target_encoder=None)
-            by_states = load_target_encoder(Path(run) / f"align/astra/seed_{seed}" / TARGET_ENCODER)
+            states = replace(load_policy(run, row, seed=seed), target_encoder=None, sensing=None)
             for way, policy, see in (
                 ("ψ^t from pictures", replace(states, target_encoder=camera, sensing=camera), seen),
                 ("ψ^s on φ from pictures", replace(states, sensing=camera), seen),
-                ("ψ^t from states", replace(states, target_encoder=by_states), torch.tensor),
+                ("ψ^t from states", replace(states, target_encoder=tracking), torch.tensor),
                 ("ψ^s on φ of states", states, torch.tensor),
             ):
                 print(f"{row}, seed {seed}, {way}: {deliver(policy, see)}", flush=True)

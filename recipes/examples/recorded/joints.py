@@ -21,6 +21,8 @@ SIDES = [
     for side in "lr"
     for joint in ("hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll")
 ]
+STILL_RAD = 0.05
+"""A second in which no joint moves farther shows nothing."""
 
 
 class Joints(FreeStates):
@@ -75,9 +77,10 @@ def states(place):
 
 
 def stretches(state, fps):
-    """Yield first and last row of each second."""
+    """Yield first and last row of each second in which a joint moves."""
     for first in range(0, len(state) - fps, fps):
-        yield first, first + fps
+        if np.ptp(state[first : first + fps], axis=0).max() > STILL_RAD:
+            yield first, first + fps
 
 
 if __name__ == "__main__":
