@@ -190,7 +190,7 @@ class _Felt:
     best_shift: int
 
     @classmethod
-    def of(cls, log: _Log, pairing: Pairing, fps: float, progress: Progress) -> "_Felt":
+    def of(cls, log: _Log, pairing: Pairing, fps: float, progress: Progress = silent) -> "_Felt":
         lengths = log.step[np.flatnonzero(np.diff(log.step, append=0) <= 0)] + 1
         lags = max(1, min(LONGEST_STEPS, int(LONGEST_S * fps), int(np.median(lengths)) // 2))
         rows, size = np.flatnonzero(log.step >= lags), log.action.shape[1]
