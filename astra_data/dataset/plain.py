@@ -228,13 +228,14 @@ def episodes_files(root: Path) -> list[Path]:
     return sorted((root / "meta/episodes").glob("*/*.parquet"))
 
 
-def episode_rows(root: Path) -> Iterator[dict[str, Any]]:
-    """Yield the rows of meta/episodes."""
+def episode_rows(root: Path, *, statistics: bool) -> Iterator[dict[str, Any]]:
+    """Yield the rows of meta/episodes, with or without the episodes' statistics."""
     for path in episodes_files(root):
         try:
             with open_parquet(path) as file:
                 # As Python objects, the statistics of an episode take tens of kilobytes.
-                for batch in file.iter_batches(EPISODES_AT_ONCE):
+                kept = [name for name in file.schema_arrow.names if statistics or not name.startswith("stats/")]
+                for batch in file.iter_batches(EPISODES_AT_ONCE, columns=kept):
                     yield from batch.to_pylist()
         except UNREADABLE as error:
             raise CorruptDatasetError(f"{path.name} cannot be read ({in_short(error)})") from error

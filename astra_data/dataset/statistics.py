@@ -1,6 +1,7 @@
 """Exact statistics of columns in float64, with LeRobot's names and shapes."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -9,25 +10,33 @@ import pyarrow as pa
 
 from astra_data.core.arrays import Floats, as_rows
 from astra_data.dataset.columns import Array, Column
-from astra_data.dataset.format import EPISODES_PATH, QUANTILES, STATISTICS, STORED_STATISTICS, episodes_schema
+from astra_data.dataset.format import (
+    COMPRESSIONS,
+    EPISODES_PATH,
+    QUANTILES,
+    STATISTICS,
+    STORED_STATISTICS,
+    episodes_schema,
+)
 from astra_data.dataset.parquet import RotatingWriter, read_arrays, to_lists
 from astra_data.dataset.plain import PlainColumn
 
-BLOCK_VALUES = 2**26  # values held in memory at once: 256 MiB of float32
+BLOCK_BYTES = 192 * 2**20  # of values held in memory at once, unless those of one index are more
+_PART = 2**18  # rows that are centered at once
 ROWS_AT_ONCE = 1000  # rows held in memory before they are written
 
 
-def statistics(rows: Floats) -> Floats:
+def statistics(rows: Array) -> Floats:
     """Return `STATISTICS` (9, size) of `rows` (size, T), sorted in place; quantiles are interpolated."""
     # One row per index: numpy then sums pairwise, and sorting is fast.
-    mean = rows.mean(axis=1)
-    centered = rows - mean[:, None]
-    np.square(centered, out=centered)
-    std = np.sqrt(centered.mean(axis=1))
+    count = rows.shape[1]
+    mean = rows.mean(axis=1, dtype=np.float64)
+    parts = (rows[:, first : first + _PART] - mean[:, None] for first in range(0, count, _PART))
+    std = np.sqrt(sum(np.square(part).sum(axis=1) for part in parts) / count)
     rows.sort(axis=1)
-    position = np.array(QUANTILES) * (rows.shape[1] - 1)
+    position = np.array(QUANTILES) * (count - 1)
     below = np.floor(position).astype(np.intp)
-    lower, upper = rows[:, below], rows[:, np.ceil(position).astype(np.intp)]
+    lower, upper = (rows[:, at].astype(np.float64) for at in (below, np.ceil(position).astype(np.intp)))
     quantiles = lower + (upper - lower) * (position - below)
     return np.vstack([rows[:, 0], rows[:, -1], mean, std, quantiles.T])
 
@@ -49,21 +58,22 @@ def side_by_side[C: (Column, PlainColumn)](columns: Iterable[C]) -> Iterator[tup
 
 
 def global_statistics(columns: Sequence[Column], frames: int, paths: Sequence[Path]) -> dict[str, dict[str, list[Any]]]:
-    """Return meta/stats.json over all `frames`; quantiles are exact: memory grows by up to 20 bytes per frame."""
-    indices = [(column, index) for column in columns for index in range(column.size)]
+    """Return meta/stats.json over all `frames`; quantiles are exact: all rows of an index are held in memory."""
     parts: dict[str, list[Floats]] = {column.name: [] for column in columns}
-    at_once = max(1, BLOCK_VALUES // frames)
-    for first in range(0, len(indices), at_once):
-        chosen = indices[first : first + at_once]
-        rows = [np.empty(frames, column.dtype) for column, _ in chosen]
+    indices = [(column, index) for column in columns for index in range(column.size)]
+    bytes_of = [frames * np.dtype(column.dtype).itemsize for column, _ in indices]
+    groups = np.cumsum(bytes_of) // BLOCK_BYTES
+    for _, group in groupby(zip(groups.tolist(), indices, strict=True), lambda one: one[0]):
+        chosen = [one for _, one in group]
+        rows = [np.empty((1, frames), column.dtype) for column, _ in chosen]
         end = 0
         names = {column.name for column, _ in chosen}
         for block in read_arrays(paths, [column for column in columns if column.name in names]):
             begin, end = end, end + len(next(iter(block.values())))
             for row, (column, index) in zip(rows, chosen, strict=True):
-                row[begin:end] = as_rows(block[column.name])[:, index]
+                row[0, begin:end] = as_rows(block[column.name])[:, index]
         for row, (column, _) in zip(rows, chosen, strict=True):
-            parts[column.name].append(statistics(row[None].astype(np.float64)))
+            parts[column.name].append(statistics(row))
     stats: dict[str, dict[str, list[Any]]] = {}
     for name, part in parts.items():
         named = dict(zip(STATISTICS, np.concatenate(part, axis=1).tolist(), strict=True))
@@ -93,7 +103,9 @@ class EpisodeRows:
     def __init__(self, root: Path, columns: list[Column], task: str, cameras: Mapping[str, Mapping[str, Any]]) -> None:
         self._columns, self._task, self._schema = columns, task, episodes_schema(columns, cameras)
         self.pictures: list[Mapping[str, Any]] = []
-        self._writer = RotatingWriter(root, EPISODES_PATH, self._schema)
+        kept = [f"stats/{column.name}/{name}.list.element" for column in columns for name in STATISTICS]
+        encodings = dict.fromkeys(kept, "BYTE_STREAM_SPLIT")
+        self._writer = RotatingWriter(root, EPISODES_PATH, self._schema, encodings, COMPRESSIONS[1])
         self._rows: list[tuple[int, int, int]] = []
         self._statistics: list[Floats] = []
         self._episodes = self._frames = 0
@@ -128,7 +140,9 @@ class EpisodeRows:
         rows: list[Array] = [lengths, chunks, files, ends - lengths, ends]
         arrays = [pa.array(episodes), pa.array([[self._task]] * count), *map(pa.array, rows)]
         stacked = np.stack(self._statistics)
-        for _, part in side_by_side(self._columns):
+        for column, part in side_by_side(self._columns):
+            if column.dtype == "float32":  # more digits would take more room than the values of short episodes
+                stacked[:, :, part] = stacked[:, :, part].astype(np.float32)
             for name in STORED_STATISTICS:
                 values = lengths[:, None] if name == "count" else stacked[:, STATISTICS.index(name), part]
                 arrays.append(to_lists(values))

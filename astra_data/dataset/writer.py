@@ -18,9 +18,10 @@ from astra_data.core.errors import AstraDataError, BadInputError, CorruptDataset
 from astra_data.dataset import columns as names
 from astra_data.dataset import description as described
 from astra_data.dataset import format as layout
+from astra_data.dataset import parquet
 from astra_data.dataset.cameras import ClipWriter, images, pooled
 from astra_data.dataset.columns import Column, Episode, Scalar
-from astra_data.dataset.parquet import RotatingWriter, to_arrow, to_numpy
+from astra_data.dataset.parquet import to_arrow, to_numpy
 from astra_data.dataset.plain import data_files, flag_faults, open_end_faults, read_object
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.statistics import EpisodeRows, episode_statistics, global_statistics
@@ -96,6 +97,9 @@ class DatasetWriter:
         self._cameras = dict(cameras or {})
         images_of = [name for name, feature in self._cameras.items() if feature["dtype"] == "image"]
         self._schema = layout.data_schema(self._stored, images_of)
+        self._most_rows = 1 if images_of else parquet.GROUP_ROWS  # of several episodes
+        self._group: list[dict[str, Any]] = []  # values or images of the episodes of the next row group
+        self._group_rows = 0
         self._fps, self._task, self._subset_seed, self._compression = fps, task, subset_seed, compression
         self._description = described.complete_description(description)
         self.made: dict[str, Any] = {}
@@ -118,7 +122,9 @@ class DatasetWriter:
         with ExitStack() as stack:
             self._folder = stack.enter_context(durable.atomic_folder(self.root))
             encodings = layout.data_encodings(self._stored)
-            self._data = RotatingWriter(self._folder, layout.DATA_PATH, self._schema, encodings, self._compression)
+            self._data = parquet.RotatingWriter(
+                self._folder, layout.DATA_PATH, self._schema, encodings, self._compression
+            )
             stack.callback(self._data.abandon)
             self._rows = EpisodeRows(self._folder, self._stored, self._task, self._cameras)
             self._clips = {
@@ -167,14 +173,16 @@ class DatasetWriter:
             length, uid=episode.uid, episode=len(self._lengths), start=self._frames, fps=self._fps
         )
         values[names.TIMESTAMP] = values[names.TIMESTAMP].astype(np.float32)
+        held = {name: np.array(column) for name, column in values.items()} | {
+            name: pa.array(images(clip), layout.IMAGE)
+            for name, clip in episode.cameras.items()
+            if name in self._schema.names
+        }
+        if self._group_rows + length > self._most_rows:
+            self._write_group()
         chunk, file = self._data.locate()
-        arrays = [
-            to_arrow(values[field.name], field.type)
-            if field.name in values
-            else pa.array(images(episode.cameras[field.name]), field.type)
-            for field in self._schema
-        ]
-        self._data.write(pa.Table.from_arrays(arrays, schema=self._schema))
+        self._group.append(held)
+        self._group_rows += length
         for name, column in values.items():
             self._hash.update(name, column)
             self._digests[name].append(described.digest_of(column))
@@ -183,8 +191,21 @@ class DatasetWriter:
         self._lengths[episode.uid] = length
         self._metadata.append(episode.metadata)
 
+    def _write_group(self) -> None:
+        """Write the episodes that are held as a row group; images are those of one."""
+        if self._group:
+            arrays = [
+                self._group[0][field.name]
+                if field.type == layout.IMAGE
+                else to_arrow(np.concatenate([one[field.name] for one in self._group]), field.type)
+                for field in self._schema
+            ]
+            self._data.write(pa.Table.from_arrays(arrays, schema=self._schema))
+            self._group, self._group_rows = [], 0
+
     def _finish(self) -> None:
         """Close the data files, write all other files and verify."""
+        self._write_group()
         self._data.close()
         self._rows.close()
         for clips in self._clips.values():

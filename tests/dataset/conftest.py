@@ -13,6 +13,7 @@ from fake_dataset import fake_columns, write_fake, writer
 from fake_frames import NAMES
 from shared_runs import shared
 
+from astra_data.dataset import parquet
 from astra_data.dataset.columns import Episode
 from astra_data.dataset.frames import Frames
 from astra_data.dataset.reader import Dataset
@@ -22,6 +23,12 @@ from astra_data.dataset.reader import Dataset
 def fake(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     """The fake dataset, for tests that only read it."""
     return write_fake(tmp_path_factory.mktemp("shared") / "set")
+
+
+@pytest.fixture
+def lonely(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each episode gets a row group of its own."""
+    monkeypatch.setattr(parquet, "GROUP_ROWS", 1)
 
 
 @pytest.fixture(scope="session")

@@ -40,22 +40,30 @@ def test_episodes_come_back_one_by_one(fake: Dataset, monkeypatch: pytest.Monkey
     assert [list(episode.columns) for episode in fake.episodes([STATE])] == [[STATE]] * len(LENGTHS)
 
 
-def test_only_the_row_groups_of_chosen_episodes_are_read(fake: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("group_rows", "chosen", "groups"),
+    [(1, [4, 0, 2], [0, 2, 4]), (20, [4, 0, 2], [0, 2]), (20, [1], [0]), (20, [3], [1]), (2**12, [1], [0])],
+)
+def test_only_the_row_groups_of_chosen_episodes_are_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, group_rows: int, chosen: list[int], groups: list[int]
+) -> None:
+    monkeypatch.setattr(parquet, "GROUP_ROWS", group_rows)
+    dataset = write_fake(tmp_path / "set")
     read = pq.ParquetFile.read_row_groups
-    groups: list[int] = []
+    found: list[int] = []
 
     def spy(file: pq.ParquetFile, row_groups: list[int], **options: object) -> object:
-        groups.extend(row_groups)
+        found.extend(row_groups)
         return read(file, row_groups, **options)
 
     monkeypatch.setattr(pq.ParquetFile, "read_row_groups", spy)
-    columns = fake.columns([STATE, "mode"], episodes=[4, 0, 2])
-    assert groups == [0, 2, 4]
-    rows = [*range(7), *range(8, 20), *range(50, 55)]
+    columns = dataset.columns([STATE, "mode"], episodes=chosen)
+    assert found == groups
+    whole = fake_episodes()
     for name, values in columns.items():
         assert values.flags.c_contiguous
-        np.testing.assert_array_equal(values, concatenated(name)[rows])
-    assert fake.columns([]) == {}
+        np.testing.assert_array_equal(values, np.concatenate([whole[index].columns[name] for index in sorted(chosen)]))
+    assert dataset.columns([]) == {}
 
 
 def test_what_the_writer_was_told_comes_back(fake: Dataset) -> None:

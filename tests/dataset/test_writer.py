@@ -5,13 +5,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import fake_dataset
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from fake_dataset import (
     COLUMNS,
     DESCRIPTION,
+    LENGTHS,
     fake_columns,
     fake_episode,
     fake_episodes,
@@ -62,11 +62,32 @@ def test_how_it_was_made_is_told_beside_the_content_hash_only(tmp_path: Path) ->
     assert {name for name in before if before[name] != after[name]} == {"meta/astra/dataset.json"}
 
 
-def test_one_row_group_per_episode_in_encodings_that_suit_the_values(tmp_path: Path) -> None:
-    [path] = write_fake(tmp_path / "set").paths
-    metadata = pq.read_metadata(path)
-    lengths = [metadata.row_group(group).num_rows for group in range(metadata.num_row_groups)]
-    assert lengths == list(fake_dataset.LENGTHS)
+@pytest.mark.parametrize(
+    ("group_rows", "lengths"), [(1, LENGTHS), (7, LENGTHS), (8, (8, 12, 30, 5)), (20, (20, 30, 5)), (2**12, (55,))]
+)
+def test_small_episodes_share_a_row_group(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, group_rows: int, lengths: tuple[int, ...]
+) -> None:
+    alone = write_fake(tmp_path / "alone")
+    monkeypatch.setattr(parquet, "GROUP_ROWS", group_rows)
+    dataset = write_fake(tmp_path / "set")
+    metadata = pq.read_metadata(dataset.paths[0])
+    assert tuple(metadata.row_group(group).num_rows for group in range(metadata.num_row_groups)) == lengths
+    assert dataset.content_hash == alone.content_hash
+    assert pq.read_table(dataset.paths[0]).equals(pq.read_table(alone.paths[0]))
+
+
+def test_an_episode_may_be_altered_once_it_is_added(tmp_path: Path) -> None:
+    with writer(tmp_path / "set") as open_writer:
+        for episode in fake_episodes():
+            open_writer.add(episode)
+            for values in episode.columns.values():
+                values[:] = 0
+    assert Dataset.open(tmp_path / "set").content_hash == write_fake(tmp_path / "kept").content_hash
+
+
+def test_encodings_suit_the_values(tmp_path: Path) -> None:
+    metadata = pq.read_metadata(write_fake(tmp_path / "set").paths[0])
     chunks = [metadata.row_group(0).column(index) for index in range(metadata.num_columns)]
     encodings = {chunk.path_in_schema: chunk.encodings for chunk in chunks}
     assert "BYTE_STREAM_SPLIT" in encodings["observation.state.list.element"]
@@ -74,6 +95,7 @@ def test_one_row_group_per_episode_in_encodings_that_suit_the_values(tmp_path: P
     assert {chunk.compression for chunk in chunks} == {"SNAPPY"}
 
 
+@pytest.mark.usefixtures("lonely")
 def test_files_rotate_when_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = write_fake(tmp_path / "whole")
     monkeypatch.setattr(parquet, "FILE_SIZE_LIMIT", 2_000)

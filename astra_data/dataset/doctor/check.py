@@ -220,8 +220,8 @@ class EpisodeChecks:
             report.fault("tasks", f"{layout.TASKS_PATH} {tasks}")
         else:
             self.tasks = tasks
-        every = _every_run(self.root, self.columns)
-        for number, (run, row) in enumerate(zip_longest(every, plain.episode_rows(self.root))):
+        rows = plain.episode_rows(self.root, statistics=not self.digests)
+        for number, (run, row) in enumerate(zip_longest(_every_run(self.root, self.columns), rows)):
             if run is None:
                 report.fault("meta/episodes", f"meta/episodes has episode {number}, the data has not")
                 continue
@@ -273,7 +273,7 @@ class EpisodeChecks:
             "dataset_to_index": (row.get("dataset_to_index"), start + len(run)),
         }
         named, listed = self.info["data_path"].format(**place) if known else None, row.get("tasks")
-        compared["the file"] = (named, str(run.path.relative_to(self.root)))
+        compared["the file"] = (named, run.path.as_posix().removeprefix(f"{self.root.as_posix()}/"))
         if not isinstance(listed, list) or set(map(str, listed)) != set(map(str, present)):
             compared["tasks"] = (listed, present)
         for key, (found, expected) in compared.items():

@@ -60,6 +60,9 @@ def whole_runs(
         number, first, frame = _claimed(run)
         place = places.get(number)
         if frame > 0 or (is_cut and (place is None or place.length != len(run))):
+            if is_cut:
+                rows = f"rows {run.row} to {run.row + len(run) - 1} of {_name(run.path)}"
+                notes.append(f"left out {rows}: they may be part of an episode")
             continue  # a part of an episode whose other rows are lost
         is_known = place is not None and place.length == len(run) and place.first_row in (None, first)
         if place is None and number < most:
@@ -142,10 +145,8 @@ def _runs_of(path: Path, columns: Sequence[plain.PlainColumn], notes: list[str])
                 rows = f"rows {starts[group]} to {starts[group + 1] - 1}"
                 notes.append(f"{_name(path)} {rows} cannot be read ({fault})")
     # LeRobot writes a row group per episode. With others, the last episode may be incomplete.
-    if held is not None and not is_whole and len(held) != counts[-1]:
-        notes.append(f"the last {len(held)} frames in {path.name} may be part of an episode and were left out")
-    elif held is not None:
-        yield held, False
+    if held is not None:
+        yield held, not is_whole and len(held) != counts[-1]
 
 
 def _row_groups(file: pq.ParquetFile, columns: Sequence[plain.PlainColumn]) -> Iterator[tuple[int, pa.Table | str]]:

@@ -169,6 +169,7 @@ def test_columns_that_differ_from_the_declared_are_told(tmp_path: Path) -> None:
         assert part in faults
 
 
+@pytest.mark.usefixtures("lonely")
 def test_a_missing_file_is_named_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(parquet, "FILE_SIZE_LIMIT", 500)  # a file for each episode
     root = write_fake(tmp_path / "set").root

@@ -211,7 +211,7 @@ def test_an_episode_that_may_have_been_cut_is_left_out(tmp_path: Path) -> None:
     (root / EPISODES).unlink()
     repaired = repair(root, out=tmp_path / "saved")
     assert repaired.episodes == 4
-    assert any("the last 5 frames in file-000.parquet may be part" in note for note in repaired.notes)
+    assert f"left out rows 50 to 54 of {DATA}: they may be part of an episode" in repaired.notes
 
 
 def test_metadata_is_joined_by_uid(tmp_path: Path) -> None:

@@ -77,14 +77,38 @@ def deface(path: Path, group: int, column: str) -> None:
 
 @pytest.mark.parametrize("column", ["action", "episode_index", "frame_index"])
 @pytest.mark.parametrize("is_digested", [False, True])
-def test_an_unreadable_row_group_costs_its_episode_alone(tmp_path: Path, column: str, *, is_digested: bool) -> None:
+@pytest.mark.parametrize(("group_rows", "lost", "rows"), [(1, [2], "8 to 19"), (20, [0, 1, 2], "0 to 19")])
+def test_an_unreadable_row_group_costs_its_episodes_alone(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    column: str,
+    group_rows: int,
+    lost: list[int],
+    rows: str,
+    *,
+    is_digested: bool,
+) -> None:
+    monkeypatch.setattr(parquet, "GROUP_ROWS", group_rows)
     dataset = write_fake(tmp_path / "set")
     digests = read_digests(dataset.root, dataset.features) if is_digested else None
-    deface(dataset.root / DATA, 2, column)
+    deface(dataset.root / DATA, 2 if len(lost) == 1 else 0, column)
     uids, notes = salvaged(dataset.root, digests)
-    assert uids == [uid for number, uid in enumerate(UIDS) if number != 2]
-    assert notes[0].startswith(f"{DATA} rows 8 to 19 cannot be read (")
-    assert notes[1:] == ["left out episode 2: rows that belong there cannot be read"]
+    assert uids == [uid for number, uid in enumerate(UIDS) if number not in lost]
+    assert notes[0].startswith(f"{DATA} rows {rows} cannot be read (")
+    which = " 2" if len(lost) == 1 else "s 0 to 2"
+    assert notes[1:] == [f"left out episode{which}: rows that belong there cannot be read"]
+
+
+def test_of_a_shared_row_group_before_the_end_of_a_cut_file_every_episode_is_recovered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(parquet, "GROUP_ROWS", 30)
+    root = write_fake(tmp_path / "set").root  # episodes 0 to 2, 3, and 4
+    path = root / DATA
+    metadata = pq.read_metadata(path)
+    path.write_bytes(path.read_bytes()[: metadata.row_group(1).column(0).data_page_offset + 1])
+    uids, notes = salvaged(root)
+    assert uids == UIDS[:3] and notes[1:] == ["left out episodes 3 to 4: rows that belong there cannot be read"]
 
 
 @pytest.mark.parametrize(
@@ -107,6 +131,7 @@ def test_episodes_with_rows_in_an_unreadable_row_group_are_left_out(
     assert salvaged(root)[0] == [UIDS[index] for index in left]
 
 
+@pytest.mark.usefixtures("lonely")
 def test_without_meta_episodes_the_rows_tell_which_episode_follows(tmp_path: Path) -> None:
     root = write_fake(tmp_path / "set").root
     drop(EPISODES)(root)
@@ -116,6 +141,7 @@ def test_without_meta_episodes_the_rows_tell_which_episode_follows(tmp_path: Pat
     assert uids == UIDS[2:] and notes[-1] == "left out episodes 0 to 1: rows that belong there cannot be read"
 
 
+@pytest.mark.usefixtures("lonely")
 def test_a_file_that_comes_twice_costs_no_episode(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(parquet, "FILE_SIZE_LIMIT", 500)  # a file for each episode
     root = write_fake(tmp_path / "set").root
@@ -127,6 +153,7 @@ def test_a_file_that_comes_twice_costs_no_episode(tmp_path: Path, monkeypatch: p
     assert note == "left out rows 0 to 0 of data/chunk-000/file-002a.parquet: they are of episode 1 once more"
 
 
+@pytest.mark.usefixtures("lonely")
 @pytest.mark.parametrize("has_places", [True, False])
 @pytest.mark.parametrize("damage", ["defaced", "rubbish", "without a column", "missing"])
 def test_a_lost_file_costs_its_episodes_alone(
