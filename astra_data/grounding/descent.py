@@ -84,7 +84,9 @@ class Descent:
         self._least, self._weights = float("inf"), dict[str, Tensor]()
         self._model, self._config = model, config
         self.parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
-        self._optimizer = torch.optim.AdamW(self.parameters, config.learning_rate, weight_decay=weight_decay)
+        self._optimizer = torch.optim.AdamW(
+            self.parameters, config.learning_rate, weight_decay=weight_decay, foreach=True
+        )
         self._schedule = torch.optim.lr_scheduler.CosineAnnealingLR(self._optimizer, config.updates)
         self._parts: dict[str, Any] = {"model": model, "optimizer": self._optimizer, "schedule": self._schedule}
         self._logbook = Logbook(checkpoint, self._go_on)

@@ -193,7 +193,7 @@ def execute(
 
     def begin(item: Item) -> None:
         if (worker := next((one for one in workers if one.key is None), None)) is None:
-            workers.append(worker := _Worker())
+            workers.append(worker := _Worker(prepare))
         num_threads = max(1, cores() // min(jobs, counts[item.stage]))
         worker.begin(item.key, pickled(item, prepare, num_threads), logs / f"{item.key}.txt")
 
@@ -212,6 +212,8 @@ def execute(
 
     before = {number: signal.signal(number, interrupt) for number in signals}
     try:
+        # While the first items are made alone, the others import what theirs will need.
+        workers += [_Worker(prepare) for _ in range(min(jobs, max(counts.values(), default=0)))]
         run_in_order(items, jobs, watch, begin, events)
     finally:
         for worker in workers:
@@ -225,11 +227,11 @@ def execute(
 class _Worker:
     """A process that runs one item after another: the one of `key`, if it is busy."""
 
-    def __init__(self) -> None:
+    def __init__(self, prepare: Callable[[], object] | None) -> None:
         context = multiprocessing.get_context("spawn")
         self.key: str | None = None
         self.connection, theirs = context.Pipe()
-        self.process = context.Process(target=_serve, args=(theirs,))
+        self.process = context.Process(target=_serve, args=(theirs, prepare))
         # Ctrl-C reaches every process of the terminal; children ignore it and are stopped by this one.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
         self.process.start()
@@ -266,7 +268,7 @@ class _Worker:
         self.connection.close()
 
 
-def _serve(connection: Connection) -> None:
+def _serve(connection: Connection, _imported: Callable[[], object] | None) -> None:
     signal.signal(signal.SIGTERM, signal.SIG_DFL)  # a forked process would have the parent's handler
     parent = multiprocessing.parent_process()
     assert parent is not None

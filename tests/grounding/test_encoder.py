@@ -106,6 +106,8 @@ def test_episodes_in_one_sequence_do_not_touch(encoder: HistoryEncoder) -> None:
     torch.testing.assert_close(states[:1, 0], encoder.step(inputs[:1, 0], hidden[:1]))
     torch.testing.assert_close(states[:1, 4:], encoder.sequence(inputs[:1, 4:])[1])
     torch.testing.assert_close(states[1:], encoder.sequence(inputs[1:])[1])
+    with torch.no_grad():
+        torch.testing.assert_close(encoder.through_episodes(inputs, hidden, start), states)
 
 
 def test_gradients_are_those_of_steps_one_after_another(encoder: HistoryEncoder) -> None:

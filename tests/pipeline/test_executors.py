@@ -262,16 +262,34 @@ def _is_gone(pid: int) -> bool:
     return False
 
 
-def test_a_process_runs_one_item_after_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def processes(monkeypatch: pytest.MonkeyPatch) -> list[object]:
+    """Processes that were started for items."""
     made, worker = list[object](), local_executor._Worker
 
-    def noted() -> object:
-        made.append(worker())
+    def noted(prepare: Callable[[], object] | None) -> object:
+        made.append(worker(prepare))
         return made[-1]
 
     monkeypatch.setattr(local_executor, "_Worker", noted)
+    return made
+
+
+def test_a_process_runs_one_item_after_another(tmp_path: Path, processes: list[object]) -> None:
     record = Record()
     items = [Item(key, (), partial(touch, tmp_path / key, ())) for key in "ab"]
     with pytest.raises(MissingStageError):
         execute([*items, Item("c", ("b",), fail)], jobs=1, logs=tmp_path / "logs", watch=record)
-    assert len(made) == 1 and record.events[-1] == ("failed", "c")
+    assert len(processes) == 1 and record.events[-1] == ("failed", "c")
+
+
+@pytest.mark.parametrize(("jobs", "most"), [(1, 1), (3, 2)])
+def test_processes_for_what_comes_later_start_with_the_first_item(
+    jobs: int, most: int, tmp_path: Path, processes: list[object]
+) -> None:
+    """Two items of the second stage can be made at once, when the only one of the first is there."""
+    found = list[int]()
+    names = {"first/a": (), "second/b": ("first/a",), "second/c": ("first/a",)}
+    items = [Item(key, inputs, partial(touch, tmp_path / key[-1], ())) for key, inputs in names.items()]
+    execute(items, jobs=jobs, logs=tmp_path / "logs", watch=lambda key, event: found.append(len(processes)))
+    assert found[0] == len(processes) == most
