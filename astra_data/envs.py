@@ -26,7 +26,5 @@ for _maze, _task, _horizon in (("UMaze", "antmaze-umaze", 700), ("Long", "antmaz
         )
 
 gymnasium.register(
-    "astra_data/Grounded-v0",
-    entry_point=f"{_GROUNDED}:grounded",
-    vector_entry_point=f"{_GROUNDED}:grounded_vector",
+    "astra_data/Grounded-v0", entry_point=f"{_GROUNDED}:grounded", vector_entry_point=f"{_GROUNDED}:grounded_vector"
 )

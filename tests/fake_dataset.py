@@ -1,41 +1,34 @@
 """Small datasets for tests."""
 
+import io
 import os
 import signal
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from PIL import Image
 
 from astra_data.core import durable
-from astra_data.dataset.columns import (
-    ACTION,
-    DONE,
-    OUTCOME_COLUMNS,
-    REWARD,
-    STATE,
-    SUCCESS,
-    TERMINATED,
-    TRUNCATED,
-    Array,
-    Column,
-    Episode,
-)
+from astra_data.dataset import columns as keys
+from astra_data.dataset.format import IMAGE
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.writer import DatasetWriter, StagedWriter
 
 COLUMNS = (
-    Column(
-        STATE,
+    keys.Column(
+        keys.STATE,
         size=3,
         names=("x", "y", "yaw"),
         meaning="pose",
         astra={"unit": ["m", "m", "rad"], "role": ["position", "position", "heading"]},
     ),
-    Column(ACTION, size=2, names=("x", "y")),
-    *OUTCOME_COLUMNS,
-    Column("mode", "int64", meaning="which gait"),
+    keys.Column(keys.ACTION, size=2, names=("x", "y")),
+    *keys.OUTCOME_COLUMNS,
+    keys.Column("mode", "int64", meaning="which gait"),
 )
 DESCRIPTION: Mapping[str, Any] = {
     "name": "fake",
@@ -47,32 +40,32 @@ DESCRIPTION: Mapping[str, Any] = {
 LENGTHS = (7, 1, 12, 30, 5)
 
 
-def fake_columns(length: int, seed: int) -> dict[str, Array]:
+def fake_columns(length: int, seed: int) -> dict[str, keys.Array]:
     rng = np.random.default_rng(seed)
     last = np.arange(length) == length - 1
     state = rng.normal(size=(length, 3)).astype(np.float32)
     # A far-off coordinate with tiny spread: float32 sums of squares lose it altogether.
     state[:, 1] = 100.0 + 0.01 * state[:, 1]
     return {
-        STATE: state,
-        ACTION: rng.uniform(-1, 1, size=(length, 2)).astype(np.float32),
-        REWARD: rng.normal(size=length).astype(np.float32),
-        TERMINATED: last & bool(seed % 2),
-        TRUNCATED: last & (not seed % 2),
-        DONE: last,
-        SUCCESS: last & bool(seed % 2),
+        keys.STATE: state,
+        keys.ACTION: rng.uniform(-1, 1, size=(length, 2)).astype(np.float32),
+        keys.REWARD: rng.normal(size=length).astype(np.float32),
+        keys.TERMINATED: last & bool(seed % 2),
+        keys.TRUNCATED: last & (not seed % 2),
+        keys.DONE: last,
+        keys.SUCCESS: last & bool(seed % 2),
         "mode": rng.integers(-5, 2**40, size=length),
     }
 
 
-def fake_episode(uid: int, length: int) -> Episode:
+def fake_episode(uid: int, length: int) -> keys.Episode:
     metadata: dict[str, float | int | bool | str] = {"success": bool(uid % 2), "return": 0.5 * uid}
     if uid % 3 == 0:
         metadata["source_episode"] = uid - 1
-    return Episode(uid, fake_columns(length, seed=uid), metadata)
+    return keys.Episode(uid, fake_columns(length, seed=uid), metadata)
 
 
-def fake_episodes() -> list[Episode]:
+def fake_episodes() -> list[keys.Episode]:
     return [fake_episode(uid, length) for uid, length in zip((13, 4, 2**53 + 1, 6, 0), LENGTHS, strict=True)]
 
 
@@ -93,7 +86,27 @@ def staged_writer(root: Path, **changes: Any) -> StagedWriter:
     return StagedWriter(root, **settings | changes)
 
 
-def concatenated(name: str) -> Array:
+def assert_same(found: Iterable[keys.Episode], expected: Iterable[keys.Episode]) -> None:
+    """The episodes are those expected, in the same order."""
+    for episode, other in zip(found, expected, strict=True):
+        assert (episode.uid, episode.metadata) == (other.uid, other.metadata)
+        assert episode.columns.keys() == other.columns.keys()
+        for name, values in other.columns.items():
+            np.testing.assert_array_equal(episode.columns[name], values)
+
+
+def write_images(path: Path, camera: str, pictures: Iterable[Any]) -> Path:
+    """Write a column of images."""
+    rows = []
+    for number, picture in enumerate(pictures):
+        stored = io.BytesIO()
+        Image.fromarray(picture).save(stored, "PNG")
+        rows.append({"bytes": stored.getvalue(), "path": f"{number}.png"})
+    pq.write_table(pa.table({camera: pa.array(rows, IMAGE)}), path)
+    return path
+
+
+def concatenated(name: str) -> keys.Array:
     return np.concatenate([episode.columns[name] for episode in fake_episodes()])
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from safetensors.numpy import save_file
 
-from astra_data.core.naming import seed_folder
+from astra_data.core.naming import artifact_key
 from astra_data.reports.results import TESTED, Line, Results
 from astra_data.reports.runs import Reported
 
@@ -61,7 +61,7 @@ def outcomes(success: list[int], seed: int) -> dict[str, list[float]]:
 
 
 def write_evaluation(root: Path, method: str, seed: int, percent: int | None = None, *, name: str = "") -> None:
-    folder = root / "evaluate" / (name or method) / seed_folder(seed, percent)
+    folder = root / artifact_key("evaluate", name or method, seed, percent)
     values: dict[str, object] = {
         "task": "antmaze-u",
         "method": name or method,

@@ -15,8 +15,7 @@ from astra_data.core.errors import BadInputError
 CHECKPOINT = "checkpoint.safetensors"  # name, or the end of it, of the file that a training goes on from
 _SETTINGS = "config.json"  # name of the file of the settings in a folder
 MANIFEST = "manifest.json"
-SHEET = "trials.csv"
-"""Name of the file that a person fills in, so no manifest has it."""
+SHEET = "trials.csv"  # that a person fills in, so no manifest has it
 
 
 def refuse_finished(out: Path) -> None:

@@ -27,6 +27,14 @@ Seed = Annotated[int, Field(ge=0, lt=2**63)]
 _UNNAMED = ""
 _MOST_FAULTS = 5  # of a file that no user writes by hand
 _MOST_PARTS = 64  # of a key in TOML, between dots
+_EXPECTED = {
+    "bool_type": "true or false",
+    "float_type": "a number",
+    "int_type": "a whole number",
+    "model_type": "a table",
+    "string_type": "a string in quotes",
+    "tuple_type": "an array",
+}
 
 
 def in_order(ends: tuple[float, float]) -> tuple[float, float]:
@@ -162,16 +170,6 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     if close := get_close_matches(name, known, n=1):
         return f": did you mean '{close[0]}'?"
     return f"; known: {', '.join(known)}" if known else ""
-
-
-_EXPECTED = {
-    "bool_type": "true or false",
-    "float_type": "a number",
-    "int_type": "a whole number",
-    "model_type": "a table",
-    "string_type": "a string in quotes",
-    "tuple_type": "an array",
-}
 
 
 def _fault(error: ErrorDetails, model: type[BaseModel]) -> str:

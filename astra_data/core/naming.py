@@ -30,14 +30,10 @@ def reference_of(rows: Iterable[str]) -> str | None:
     return "nas" if "nas" in map(base_method, rows) else None
 
 
-def seed_folder(seed: int, percent: int | None = None) -> str:
-    """Return the folder of a seed, inside that of the dataset size in per cent where there are several."""
-    return f"seed_{seed}" if percent is None else f"percent_{percent:03d}/seed_{seed}"
-
-
 def artifact_key(stage: str, row: str, seed: int, percent: int | None = None) -> str:
     """Return the key of an artifact, its place in the folder of a run; `row` is empty for a dataset."""
-    return "/".join(filter(None, (stage, row, seed_folder(seed, percent))))
+    size = "" if percent is None else f"percent_{percent:03d}"
+    return "/".join(filter(None, (stage, row, size, f"seed_{seed}")))
 
 
 def stage_of_key(key: str) -> str:

@@ -3,8 +3,7 @@
 import time
 from collections.abc import Callable, Mapping
 
-Progress = Callable[[float, str], None]
-"""Called with the fraction done, in [0, 1], and a short note, such as the rate and the loss."""
+Progress = Callable[[float, str], None]  # called with the fraction done, in [0, 1], and a short note, such as the rate
 CLOCKS = ("wall_seconds", "cpu_seconds")  # what is measured: time by the clock, and that of the processor
 
 

@@ -10,11 +10,9 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-MEMORY_LIMIT = Path("/sys/fs/cgroup/memory.max")
-"""Memory limit of a container in bytes, or "max"; absent outside of one."""
+MEMORY_LIMIT = Path("/sys/fs/cgroup/memory.max")  # of a container in bytes, or "max"; absent outside of one
 ROOT = Path(__file__).parents[2]
-CODE = ("astra_data", "pyproject.toml", "uv.lock")
-"""Changes of these make a checkout dirty; changes of notes and recipes do not."""
+CODE = ("astra_data", "pyproject.toml", "uv.lock")  # changes of these make a checkout dirty; of notes and recipes not
 PACKAGES = (
     *("astra-data", "gymnasium", "gymnasium-robotics", "lerobot", "mujoco"),
     *("numpy", "pandas", "scipy", "torch"),

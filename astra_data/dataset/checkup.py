@@ -24,8 +24,7 @@ LARGEST = 4 * math.pi  # few robots turn further than twice around
 class Finding:
     """What was found, and what to do about it."""
 
-    severity: Literal["warning", "note"]
-    """A warning if a grounding would be fitted to something that the robot did not do."""
+    severity: Literal["warning", "note"]  # a warning if a grounding would be fitted to what the robot did not do
     what: str
     advice: str
     episodes: tuple[int, ...] = ()  # uids of the episodes where it is; empty if it concerns the whole dataset
@@ -34,10 +33,6 @@ class Finding:
         word = "episode" if len(self.episodes) == 1 else "episodes"
         where = f" ({word} {first_few(self.episodes, SHOWN)})" if self.episodes else ""
         return f"{self.severity}: {self.what}{where}: {self.advice}"
-
-    def record(self) -> dict[str, Any]:
-        """Return it for JSON, with all its episodes."""
-        return asdict(self) | {"episodes": list(self.episodes)}
 
 
 def deletion(called: str, uids: Sequence[int]) -> str:
@@ -102,8 +97,7 @@ def _of_torn(torn: Mapping[int, tuple[int, int]]) -> list[Finding]:
 
 GAP = 1.5  # a step that takes more than so many periods is a gap
 HELD = 0.75  # periods for which an MCAP topic may be held, as is proposed: rows that lack a message hold one longer
-WRONG_RATE = 0.05
-"""Relative difference between the declared and the recorded rate above which the declared one is wrong."""
+WRONG_RATE = 0.05  # relative difference of the recorded rate above which the declared one is wrong
 JITTERY = 0.2  # periods by which 5 % of the steps are off at least in a jittery recording
 MANY_GAPS = 0.01  # share of the steps from which on gaps are many
 INNER = 0.95  # share of the steps that the rate and the jitter are of
@@ -219,13 +213,11 @@ SATURATED = 0.2  # share of steps at the edge of the range above which a command
 DISCRETE = 8  # a command with at most so many different values is a choice among them and has no edge
 STUCK = 0.5  # share of an episode without any change above which a value is stuck, if others move in as many steps
 MOST = 0.5  # share of the episodes above which they are most
-SMALLEST_SPAN = 0.01
-"""Share of its whole range that a value moves through in most episodes: noise of a simulator is no motion."""
+SMALLEST_SPAN = 0.01  # share of its range that a value moves through in most episodes: less is noise of a simulator
 MOVING = 0.1  # longest rest in most episodes: what often rests, such as a ball, is not stuck where it does
 FEWEST_STEPS = 10  # shorter episodes tell nothing of it
 FEW_FAILURES = 10  # fewer failures are little for a failure model (docs/results/failures.md)
-MOST_REPEATED = 0.05
-"""Share of the steps above which states that repeat the row before, between others that move, are many."""
+MOST_REPEATED = 0.05  # share of the steps above which states that repeat the row before, between moving ones, are many
 MOST_ROWS = 5  # rows in a row that repeat a state; a robot that stands still does so for longer
 LAGS = range(-3, 4)  # rows between a step and the action that is tried as its cause
 CLEAR = 0.2  # by how much more of the variance of steps another row's action explains, where rows are off
@@ -242,8 +234,7 @@ class Checkup:
 
     def record(self) -> dict[str, Any]:
         """Return it for JSON."""
-        findings = [finding.record() for finding in self.findings]
-        return {"dataset": self.reference, "summary": list(self.summary), "findings": findings}
+        return {"dataset": self.reference, "summary": self.summary, "findings": [*map(asdict, self.findings)]}
 
 
 def check_up(dataset: Dataset, called: str | None = None) -> Checkup:

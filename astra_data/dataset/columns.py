@@ -19,13 +19,11 @@ from astra_data.core.arrays import as_column
 from astra_data.core.errors import BadInputError, unmet
 
 STATE = "observation.state"  # (T, S) float32: the full target state s_t
-GOAL = "observation.environment_state"
-"""(T, G) float32: the goal, where a task has one; LeRobot's own policies need it to train."""
+GOAL = "observation.environment_state"  # (T, G) float32: the goal, if any; LeRobot's own policies need it to train
 ACTION = "action"  # (T, A) float32: a_t, as given to the target environment and to the abstract simulator
 NEXT_STATE = "next.observation.state"  # (T, S) float32: s_{t+1}, stored so that readers need not shift s_t
 REWARD = "next.reward"  # (T,) float32: the target reward r_t
-TERMINATED = "next.terminated"
-"""(T,) bool: the task ended, in success or failure; learners bootstrap unless this is set."""
+TERMINATED = "next.terminated"  # (T,) bool: the task ended, in success or failure; learners bootstrap unless it is set
 TRUNCATED = "next.truncated"  # (T,) bool: time ran out
 DONE = "next.done"  # (T,) bool: terminated or truncated
 SUCCESS = "next.success"  # (T,) bool: the goal is reached in s_{t+1}
@@ -36,11 +34,9 @@ ABSTRACT_SIMULATED_NEXT_STATE = "abstract.simulated_next_state"
 EPISODE_UID = "episode_uid"  # (T,) int64: identifies the episode through all later edits; filled in by the writer
 TIMESTAMP, FRAME_INDEX = "timestamp", "frame_index"
 EPISODE_INDEX, INDEX, TASK_INDEX = "episode_index", "index", "task_index"
-RESERVED = (EPISODE_UID, TIMESTAMP, FRAME_INDEX, EPISODE_INDEX, INDEX, TASK_INDEX)
-"""Columns filled in by the writer; all but the first are LeRobot's own."""
+RESERVED = (EPISODE_UID, TIMESTAMP, FRAME_INDEX, EPISODE_INDEX, INDEX, TASK_INDEX)  # filled in by the writer
 DTYPES = ("float32", "int64", "bool")
-MOST_VALUES, MOST_NAME_BYTES = 2**20, 200
-"""Upper bounds of a column: its values per step, and the bytes of its name, which also names files."""
+MOST_VALUES, MOST_NAME_BYTES = 2**20, 200  # of a column: values per step, and bytes of its name, which names files, too
 ROLES = {"position": 2, "vector": 2, "heading": 1, "quaternion": 4, "invariant": 1}
 """How a change of the planar frame acts on values (see `Column.astra`), and on how many of them at once."""
 Array = NDArray[Any]
@@ -175,8 +171,7 @@ class Clip:
     step: float
     count: int
     digest: str | None = None  # sha256 of the video, where it is known
-    statistics: Mapping[str, Any] = field(default_factory=dict, compare=False)
-    """LeRobot's, of the episode that the pictures were recorded in."""
+    statistics: Mapping[str, Any] = field(default_factory=dict, compare=False)  # LeRobot's, of the recorded episode
 
     def part(self, first: int, end: int, every: int = 1) -> "Clip":
         """Return the pictures `first` to `end`, exclusive, each `every`-th."""

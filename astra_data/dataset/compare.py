@@ -56,8 +56,8 @@ def differences(a: Dataset, b: Dataset) -> Differences:
     )
 
 
-def schema_differences(a: Dataset, b: Dataset) -> list[str]:
-    """List how the columns and fps of `b` differ from those of `a`, whatever the order of columns."""
+def schema_differences(a: Dataset, b: Dataset, described: Sequence[str] = ()) -> list[str]:
+    """List how columns, fps and the parts `described` of `b` differ from those of `a`, whatever the columns' order."""
     ours, theirs = (
         {column.name: {**vars(column), "astra": column.astra or {}} for column in dataset.schema} for dataset in (a, b)
     )
@@ -67,13 +67,8 @@ def schema_differences(a: Dataset, b: Dataset) -> list[str]:
         found += _value_differences(ours[name], theirs[name], f"column {name}: ")
     seen, other = ({name: [it.feature["dtype"], it.feature["shape"]] for name, it in d.cameras.items()} for d in (a, b))
     found += _value_differences(seen, other, "camera ")
-    return [*found, *_value_differences({"fps": a.info["fps"]}, {"fps": b.info["fps"]})]
-
-
-def world_differences(a: Dataset, b: Dataset) -> list[str]:
-    """List how the environment and the simulator of `b` differ from those of `a`."""
-    ours, theirs = ({key: dataset.description[key] for key in ("environment", "simulator")} for dataset in (a, b))
-    return list(_value_differences(ours, theirs))
+    ours, theirs = ({"fps": d.info["fps"]} | {key: d.description[key] for key in described} for d in (a, b))
+    return [*found, *_value_differences(ours, theirs)]
 
 
 def _value_differences(
@@ -124,11 +119,6 @@ def lineage(dataset: Dataset) -> Ancestors:
             found[key] = at_home.get(key) or neighbors().get(key)
             todo += _parents(found[key])
     return found
-
-
-def hashes(ancestors: Ancestors) -> set[str]:
-    """Return the content hashes of a dataset and of all its ancestors."""
-    return {content_hash for *_, content_hash in ancestors}
 
 
 def tree_lines(ancestors: Ancestors) -> Iterator[str]:

@@ -27,6 +27,16 @@ NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
 VERSION = re.compile(r"[0-9]{1,9}\.[0-9]{1,9}\.[0-9]{1,9}")  # valid versions of datasets
 _DEFAULTS: dict[str, Any] = {"name": None, "version": "1.0.0", "parents": [], "stage": None}
 _DEFAULTS |= {"config": {}, "seeds": {}, "environment": {}, "simulator": {}}
+digest_of = xxh3_64_intdigest  # of contiguous values (T,) or (T, size) of one episode
+Digests = Mapping[str, NDArray[np.uint64]]  # column to the digest of each episode, (E,)
+SEALED = (
+    layout.INFO_PATH,
+    layout.STATS_PATH,
+    layout.TASKS_PATH,
+    layout.METADATA_PATH,
+    layout.SUBSETS_PATH,
+    layout.DIGESTS_PATH,
+)  # the files with a sum, beside the description and those of meta/episodes
 
 
 def full_name(description: Mapping[str, Any]) -> str:
@@ -122,18 +132,6 @@ def read_description(root: Path) -> dict[str, Any]:
     if faults := _faults({key: found.get(key) for key in _DEFAULTS}):
         raise CorruptDatasetError(f"{DATASET_PATH}: {'; '.join(faults)}")
     return found
-
-
-digest_of = xxh3_64_intdigest  # of contiguous values (T,) or (T, size) of one episode
-Digests = Mapping[str, NDArray[np.uint64]]  # column to the digest of each episode, (E,)
-SEALED = (
-    layout.INFO_PATH,
-    layout.STATS_PATH,
-    layout.TASKS_PATH,
-    layout.METADATA_PATH,
-    layout.SUBSETS_PATH,
-    layout.DIGESTS_PATH,
-)  # the files with a sum, beside the description and those of meta/episodes
 
 
 def altered_columns(columns: Mapping[str, Array], episode: int, digests: Digests) -> list[str]:

@@ -12,7 +12,7 @@ from astra_data.core.config import did_you_mean, only_given
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import first_few
 from astra_data.dataset.columns import Scalar, distinct_uids, renamed_metadata
-from astra_data.dataset.compare import schema_differences, world_differences
+from astra_data.dataset.compare import schema_differences
 from astra_data.dataset.description import permutation
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import next_version
@@ -156,7 +156,7 @@ def merge(
     faults = [
         f"{other.reference}: {fault}"
         for other in others
-        for fault in (*schema_differences(first, other), *world_differences(first, other))
+        for fault in schema_differences(first, other, ("environment", "simulator"))
     ]
     if faults:
         expected = f"the columns, fps, environment and simulator of {first.reference} in all of them"

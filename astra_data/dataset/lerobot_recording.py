@@ -120,10 +120,11 @@ def declared_columns(folder: Path, info: Mapping[str, Any]) -> tuple[list[PlainC
     features, fps = info.get("features"), info.get("fps")
     features = features if isinstance(features, dict) else {}
     columns = plain_columns(features)[0]
-    found = {column.name: column for column in columns}
-    missing = sorted({c.name for c in DEFAULT_COLUMNS} - found.keys())
+    missing = sorted({c.name for c in DEFAULT_COLUMNS} - {c.name for c in columns})
     faults = [f"lacks the columns {', '.join(missing)}, which are LeRobot's own"] if missing else []
-    if strange := [c.name for c in DEFAULT_COLUMNS if c.name in found and not _fits(found[c.name], c)]:
+    kinds = {column.name: "f" if column.dtype == "float32" else "iu" for column in DEFAULT_COLUMNS}
+    own = [column for column in columns if column.name in kinds]
+    if strange := [c.name for c in own if c.size != 1 or np.dtype(c.dtype).kind not in kinds[c.name]]:
         faults.append(f"has no single number a step as {', '.join(strange)}")
     rate = fps if isinstance(fps, int | float) and 1 <= fps < MOST_FPS and fps == int(fps) else 0
     if not rate:
@@ -137,10 +138,6 @@ def declared_columns(folder: Path, info: Mapping[str, Any]) -> tuple[list[PlainC
             labels, kind = _labels(feature.get("names"), column.size), np.dtype(column.dtype).kind
             specs.append(Column.from_feature(column.name, feature | {"dtype": DTYPES[kind], "names": labels}))
     return columns, specs, int(rate)
-
-
-def _fits(stored: PlainColumn, own: Column) -> bool:
-    return stored.size == 1 and np.dtype(stored.dtype).kind in ("f" if own.dtype == "float32" else "iu")
 
 
 def name_of(folder: Path) -> str:
@@ -210,12 +207,7 @@ def open_recording(root: Path) -> dict[str, Any]:
     uids, lengths = [episode.uid for episode in kept], np.array([episode.steps for episode in kept])
     positions = {uid: index for index, uid in enumerate(uids)}
     described = {"codebase_version": layout.CODEBASE_VERSION}
-    description = {
-        "name": name_of(root),
-        "stage": "record",
-        "config": described,
-        "environment": robot_of(info),
-    }
+    description = {"name": name_of(root), "stage": "record", "config": described, "environment": robot_of(info)}
     all_columns, frames = layout.stored_columns(columns), int(lengths.sum())
     return dict(
         root=root,

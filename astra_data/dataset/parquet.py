@@ -14,8 +14,7 @@ from astra_data.dataset.columns import Array, Column
 from astra_data.dataset.format import CHUNK_SIZE, COMPRESSIONS, DATA_FILE_SIZE_MB
 
 FILE_SIZE_LIMIT = DATA_FILE_SIZE_MB * 2**20
-UNREADABLE = (OSError, ValueError, pa.ArrowException)
-"""Raised by pyarrow for damaged files; ValueError where names are not valid UTF-8."""
+UNREADABLE = (OSError, ValueError, pa.ArrowException)  # of damaged files; ValueError: names are not valid UTF-8
 GROUP_ROWS = 2**12  # upper bound of the rows of a row group of several episodes: the footer names all its columns
 BLOCK_ROWS = 2**16  # rows read at once, rounded up to whole row groups
 BLOCK_VALUES = 2**23  # values of arrays that are read at once, where that is fewer rows; rounded up, too
@@ -62,10 +61,7 @@ def open_parquet(path: Path) -> pq.ParquetFile:
 
 
 def read_blocks(
-    paths: Sequence[Path],
-    names: Sequence[str] | None = None,
-    wanted: Bools | None = None,
-    most_rows: int | None = None,
+    paths: Sequence[Path], names: Sequence[str] | None = None, wanted: Bools | None = None, most_rows: int | None = None
 ) -> Iterator[pa.Table]:
     """Yield the columns `names`, by default all, of all files in order, in blocks of whole `wanted` row groups."""
     end, enough = 0, most_rows or BLOCK_ROWS
@@ -122,13 +118,9 @@ class RotatingWriter:
         compression: str = COMPRESSIONS[0],
     ) -> None:
         """Start the first file; `pattern` names the files, `encodings` those of their columns."""
-        self.chunk_index = 0
-        self.file_index = 0
-        self._root = root
-        self._pattern = pattern
-        self._schema = schema
-        self._encodings = encodings
-        self._compression = compression
+        self.chunk_index = self.file_index = 0
+        self._root, self._pattern, self._schema = root, pattern, schema
+        self._encodings, self._compression = encodings, compression
         self._open()
 
     def _open(self) -> None:

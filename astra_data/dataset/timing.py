@@ -39,17 +39,8 @@ def trim(
     Where steps go from the middle of an episode, it becomes several: the first keeps its uid, the others have
     new ones, and it as "source_episode". An episode that lost its end is marked as truncated there.
 
-    Args:
-        source: the dataset.
-        start_s: time to remove from the start of each episode, s.
-        end_s: time to remove from its end, s.
-        still: remove the steps at either end in which the state does not change.
-        without: remove the steps in which a value meets this condition, such as "v < 0.05".
-        name: of the new dataset, as for `subset`.
-        out: its folder, as for `subset`.
-
-    Raises:
-        BadInputError: nothing is asked for, or would be left, or a value in the condition is not known.
+    `start_s` and `end_s` are removed from the ends of each episode, with `still` the steps there in which the state
+    does not change, and the steps that meet the condition `without`, such as "v < 0.05"; `name`, `out`: see `subset`.
     """
     config = {"start_s": start_s, "end_s": end_s, "still": still, "without": without}
     if not (any(config.values()) and 0 <= start_s < np.inf and 0 <= end_s < np.inf):
@@ -64,7 +55,9 @@ def trim(
         left = np.zeros(len(episode), bool)
         left[first : len(episode) - last] = True
         if still:
-            moving = np.flatnonzero(left & _moves(episode))
+            state = as_rows(episode.columns[names.STATE])
+            after = as_rows(episode.columns.get(names.NEXT_STATE, np.concatenate([state[1:], state[-1:]])))
+            moving = np.flatnonzero(left & (state != after).any(axis=1))
             left[: moving[0] if moving.size else None] = left[moving[-1] + 1 if moving.size else 0 :] = False
         return left & ~condition(episode) if condition else left
 
@@ -80,9 +73,6 @@ def resample(source: Dataset, fps: int, *, name: str | None = None, out: Path | 
     Angles (unit rad or deg) are interpolated the shorter way, quaternions as such. Columns of a pairing are left
     out, since steps of another length land elsewhere: pair it again. What is left of an episode after its last
     whole step adds its reward and ending to that step; an episode shorter than a step is left out.
-
-    Raises:
-        BadInputError: the rate is the present one, or no episode is long enough.
     """
     if fps < 1 or fps == source.info["fps"]:
         raise BadInputError(f"resample: expected another rate than {source.info['fps']} per second, got {fps}")
@@ -133,12 +123,6 @@ def _condition(source: Dataset, text: str) -> Callable[[Episode], Bools]:
     column, index = known[value]
     compare = _COMPARED[compared]
     return lambda episode: compare(as_rows(episode.columns[column.name])[:, index].astype(np.float64), limit)
-
-
-def _moves(episode: Episode) -> Bools:
-    state = as_rows(episode.columns[names.STATE])
-    after = as_rows(episode.columns.get(names.NEXT_STATE, np.concatenate([state[1:], state[-1:]])))
-    return np.asarray((state != after).any(axis=1))
 
 
 def _pieces(episode: Episode, kept: Bools, source: Dataset, known: set[int]) -> Iterator[Episode]:

@@ -138,17 +138,10 @@ def successor(
     parents: Iterable[Mapping[str, str]] = (),
     **more: Any,
 ) -> tuple[dict[str, Any], Path]:
-    """Return the description of the version that follows `source`, for `DatasetWriter`, and its folder.
+    """Return the description of the version that follows the description `source` by a `change`, and its folder.
 
-    Args:
-        source: the description of its first parent; name, seeds, environment and simulator are carried over.
-        change: the kind of change, which determines the version.
-        stage: the stage that writes it.
-        config: the stage's settings.
-        name: of a new dataset, which begins with version 1.0.0; by default that of `source`.
-        out: its folder, by default one at home; the version then does not depend on those at home.
-        parents: the identities of further parents.
-        more: keys of the description that differ from those of `source`.
+    Name, seeds, environment and simulator are carried over, but for those in `more`; with another `name`, a new dataset
+    begins with version 1.0.0. With `out`, the version does not depend on those at home.
     """
     kept = {key: source[key] for key in ("seeds", "environment", "simulator")}
     name = name or source["name"]

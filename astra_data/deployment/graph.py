@@ -15,12 +15,10 @@ from astra_data.policies.running_policy import Memory, RunningPolicy, UserPolicy
 
 _DECOMPOSED: dict[Any, Callable[..., Any]] = {
     torch.ops.aten.hypot.default: lambda x, y: (x.square() + y.square()).sqrt()
-}
-"""Operations that ONNX has not."""
+}  # operations that ONNX has not
 ONNX = "policy.onnx"
 INPUTS, OUTPUTS = ("state", "goal", "hidden"), ("command", "next_hidden")
-TOLERANCE = 1e-3
-"""How far commands of the graph may be from those of the policy, in half ranges: more than rounding does."""
+TOLERANCE = 1e-3  # of commands of the graph, in half ranges: more than rounding does
 
 _COMPARED_STEPS = 100
 _MOST_DRAWS = 100  # of a state for which the policy has a command

@@ -37,9 +37,7 @@ class TargetEncoder(nn.Module):
         super().__init__()
         self.sizes: dict[str, Any] = {"state_size": state_size, "goal_size": goal_size, "action_size": action_size}
         self.sizes |= {"embedding_size": embedding_size, "latent_size": latent_size}
-        self.sizes |= {"position_octaves": position_octaves}
-        if encoder != HistoryEncoder.kind:
-            self.sizes["encoder"] = encoder
+        self.sizes |= {"position_octaves": position_octaves, "encoder": encoder}
         self.position_features = PositionFeatures(position_octaves)
         input_size = state_size + self.position_features.size + goal_size + action_size
         alike = {"embedding_size": embedding_size, "latent_size": latent_size}

@@ -93,16 +93,7 @@ class Diagnosis:
 
 
 def diagnose(dataset: str | Path, simulator: str, progress: Progress = silent) -> Diagnosis:
-    """Look at a paired dataset and its abstract simulator before anything is fitted.
-
-    Args:
-        dataset: a paired dataset, by name or folder.
-        simulator: as `pair` takes it; a file of the user's is run.
-        progress: called as the simulator steps, which takes the time.
-
-    Raises:
-        BadInputError: the dataset has not been paired, or has no two steps in a row.
-    """
+    """Look at a paired dataset and its abstract simulator, as `pair` takes it, before anything is fitted."""
     source, pairing = open_dataset(dataset), pairing_named(simulator)
     if keys.ABSTRACT_STATE not in source.features:
         raise BadInputError(f"{source.root} has no column {keys.ABSTRACT_STATE}: expected a dataset that was paired")
@@ -313,7 +304,7 @@ class _Error:
 
     @classmethod
     def of(cls, log: _Log, felt: _Felt) -> "_Error":
-        made = log.next_state - log.landed
+        made = log.error
         moved = np.abs(log.next_state - log.state).max(axis=0) + 1e-12
         wrong = made[felt.rows].std(axis=0) > 1e-6 * moved
         commands = felt.changes[:, :, 1 : _PAST_STEPS + 1, wrong]

@@ -11,6 +11,7 @@ from torch.autograd.function import FunctionCtx
 from torch.nn import functional
 
 _LONGEST_M = 16.0  # longest wavelength of position features
+_LEAST = 1e-3  # lower bound of a deviation
 
 
 def mlp(sizes: tuple[int, ...], activation: type[nn.ELU | nn.ReLU] = nn.ELU, *, inplace: bool = False) -> nn.Sequential:
@@ -224,9 +225,6 @@ class LatentEncoder(Protocol):
     def encoder_input(self, state: Tensor, goal: Tensor, previous_action: Tensor) -> Tensor:
         """Assemble the encoder's input (..., I) of states, goals and the actions that led there."""
         ...
-
-
-_LEAST = 1e-3  # lower bound of a deviation
 
 
 def take_scales(network: nn.Module, values: Mapping[str, Tensor]) -> None:

@@ -22,14 +22,21 @@ from astra_data.grounding.simulator import Grounding
 from astra_data.worlds.task import Task
 
 AVERAGED_S = (0.25, 0.5, 1.0)  # time constants of the averages of the magnitudes, beside their present values
-AHEAD_S = (0.25, 0.5, 1.0, 1.5, 2.0)
-"""How far ahead walls are looked for, both as the robot moves and as the simulator does."""
+AHEAD_S = (0.25, 0.5, 1.0, 1.5, 2.0)  # how far ahead walls are looked for, as the robot moves and as the simulator does
 FAILURE_STEPS = 2
 """Steps within which failures are predicted: of 2, 5, 10 and 20 the one with the highest likelihood of the
 moments of failures on a cart, an ant and a NAO."""
 _FARTHEST_M = 3.0  # walls farther away than this are alike
 _MAGNITUDES = 5
 _AVERAGES = len(AVERAGED_S) * _MAGNITUDES
+_MOST_FOLDS = 5
+AHEAD_STEPS = ((1, 20), (11, 30), (21, 40))  # windows before a failure, in steps, in which it is to be foreseen
+_REPLAYED = 3 * RISK_STEPS  # steps of a replay: the last come after as long as the averages of a failure model remember
+_BATCH = 512
+_FAILING_SHARE = 0.25  # of each batch: steps that fail soon are too rare to be drawn as often as they come
+_WEIGHT_DECAY = 1.0
+_DESCENT = DescentConfig(updates=200, learning_rate=3e-3)
+BINS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # edges of the probabilities in a reliability diagram
 
 
 @dataclass(frozen=True)
@@ -128,9 +135,6 @@ class FailureModel(nn.Module):
         return probability / self.shape.risk_steps
 
 
-_MOST_FOLDS = 5
-
-
 def folds(fails: Tensor, recordings: Tensor) -> list[Tensor]:
     """Split episodes (E,) at random by `recordings` (E,), those that fail alike; return who is in each of 5 at most."""
     # Numbered as they come, so that without copies each episode is drawn for in turn.
@@ -163,16 +167,6 @@ def calibration(odds: Tensor, fails: Tensor, risk_steps: int) -> tuple[Tensor, T
 
     optimizer.step(loss)
     return scale.detach().exp(), shift.detach()
-
-
-AHEAD_STEPS = ((1, 20), (11, 30), (21, 40))  # windows before a failure, in steps, in which it is to be foreseen
-_REPLAYED = 3 * RISK_STEPS
-"""Steps of a replay: the last of them come after as long as the averages of a failure model remember."""
-_BATCH = 512
-_FAILING_SHARE = 0.25  # of each batch: steps that fail soon are too rare to be drawn as often as they come
-_WEIGHT_DECAY = 1.0
-_DESCENT = DescentConfig(updates=200, learning_rate=3e-3)
-BINS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # edges of the probabilities in a reliability diagram
 
 
 def failing(task: Task, episodes: PairedEpisodes, risk_steps: int = FAILURE_STEPS) -> PairedEpisodes:
@@ -325,32 +319,26 @@ def averages_before(task: Task, grounding: Grounding, failures: FailureModel, ep
 
 @torch.no_grad()
 def failure_figures(
-    task: Task,
-    grounding: Grounding,
-    failures: FailureModel,
-    held_out: PairedEpisodes,
-    ahead: Sequence[tuple[int, int]] = AHEAD_STEPS,
+    task: Task, grounding: Grounding, failures: FailureModel, held_out: PairedEpisodes
 ) -> dict[str, Any]:
     """Return the `failure_skill` of a failure model on replays of held-out episodes."""
     probability = failures.probability(replayed_inputs(task, grounding, failures, held_out))
-    return failure_skill(probability, failing(task, held_out, failures.shape.risk_steps), ahead)
+    return failure_skill(probability, failing(task, held_out, failures.shape.risk_steps))
 
 
-def failure_skill(
-    probability: Tensor, episodes: PairedEpisodes, ahead: Sequence[tuple[int, int]] = AHEAD_STEPS
-) -> dict[str, Any]:
-    """Measure probabilities (E, T) of `fails_soon`: AUC by window `ahead`, Brier skill, reliability by bin."""
+def failure_skill(probability: Tensor, episodes: PairedEpisodes) -> dict[str, Any]:
+    """Measure probabilities (E, T) of `fails_soon`: AUC by window ahead, Brier skill, reliability by bin."""
     windows = episodes.windows
     mask = windows.mask.bool()
     fails = windows.fails_soon.bool() & mask
     count = int(fails.any(1).sum())
     if not count:
         return {"failures": 0, "auc": None, "brier_skill": None, "reliability": None}
-    calm = ahead[-1][1] + mask.shape[1]  # no failure comes, however short the episode is
+    calm = AHEAD_STEPS[-1][1] + mask.shape[1]  # no failure comes, however short the episode is
     left = torch.where(fails.any(1, keepdim=True), mask.flip(1).cumsum(1).flip(1), calm)
-    safe = probability[mask & (left > ahead[-1][1])].numpy(force=True)
+    safe = probability[mask & (left > AHEAD_STEPS[-1][1])].numpy(force=True)
     auc: dict[str, float | None] = {}
-    for first, last in ahead:
+    for first, last in AHEAD_STEPS:
         before = probability[mask & (left >= first) & (left <= last)].numpy(force=True)
         auc[f"{first}-{last}"] = ranked_above(before, safe)
     predicted, happened = probability[mask].numpy(force=True), fails[mask].numpy(force=True)

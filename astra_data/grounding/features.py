@@ -22,8 +22,7 @@ from astra_data.dataset.versions import next_version
 from astra_data.worlds.user_code import explained, file_of, user_object
 
 CAMERAS, FEATURES = "observation.images.", "observation.features."
-MADE_BY = "features"
-"""Key of a dataset's environment: the camera and the encoder of each column of features."""
+MADE_BY = "features"  # key of a dataset's environment: camera and encoder of each column of features
 DEFAULT = f"{__name__}:ENCODER"
 _AT_ONCE = 256  # pictures decoded into memory at once
 _BLUR_PIXELS, _SHARPNESS = 1.2, 20.0
@@ -111,13 +110,8 @@ def features(
 ) -> Path:
     """Write `source` with a column of features of a camera's pictures; return the new folder.
 
-    Args:
-        source: the dataset.
-        camera: its name, with or without "observation.images."; the column is "observation.features." and the rest.
-        encoder: "file.py:NAME" of a `PictureEncoder`.
-        name: of the new dataset, as for `subset`.
-        out: its folder, as for `subset`.
-        progress: told of the share that is done.
+    A camera is named with or without "observation.images."; the column is "observation.features." and the rest. The
+    `encoder` is "file.py:NAME" of a `PictureEncoder`; `name` and `out` are as for `subset`.
     """
     camera = camera if camera in source.cameras else f"{CAMERAS}{camera}"
     source.camera(camera)

@@ -16,12 +16,12 @@ from astra_data.grounding.simulator import NO_GROUNDING, FittedGrounding, Ground
 from astra_data.worlds.task import Task
 from astra_data.worlds.user_code import explained, parts_of, restored
 
-KINDS: dict[str, type[FittedGrounding]] = {HistoryGrounding.kind: HistoryGrounding}
-"""The groundings that can be read, by what their files call them."""
+KINDS: dict[str, type[FittedGrounding]] = {HistoryGrounding.kind: HistoryGrounding}  # by what files call them
 
-GROUNDING, TARGET_ENCODER = "grounding.safetensors", "target_encoder.safetensors"
-"""Names of the files of their artifacts."""
+GROUNDING, TARGET_ENCODER = "grounding.safetensors", "target_encoder.safetensors"  # files of their artifacts
 _TARGET_ENCODER = "target encoder"
+_WRITTEN = ("kind", "to_file", "from_file")  # the parts that a grounding does not inherit
+_ROUNDING = 1e-6  # between states that are the same, relative to their size and absolute
 
 
 def save_grounding(path: Path, grounding: FittedGrounding, episodes: PairedEpisodes) -> None:
@@ -58,10 +58,6 @@ def load_target_encoder(path: Path | str) -> TargetEncoder:
     """Read a target encoder; its parameters are frozen."""
     with understood(Path(path), "a target encoder", (_TARGET_ENCODER,), "cpu") as (tensors, metadata):
         return loaded(TargetEncoder(**metadata["sizes"]), tensors)
-
-
-_WRITTEN = ("kind", "to_file", "from_file")  # the parts that a grounding does not inherit
-_ROUNDING = 1e-6  # between states that are the same, relative to their size and absolute
 
 
 def missing_parts(grounding: type) -> list[str]:

@@ -26,6 +26,7 @@ from astra_data.worlds.task import Task
 
 _MEASURED_EVERY = 100
 _POSITION_OCTAVES = 4
+_CLOSEST_SHARE = 0.01  # of the recorded steps: those that were closer to a wall are not what a robot can rely on
 
 
 class GroundConfig(WindowedConfig):
@@ -62,8 +63,7 @@ class Fitting:
         return self.config.descent(int(self.training.lengths.sum()))
 
 
-Fit = Callable[[Fitting], tuple[FittedGrounding, dict[str, Any]]]
-"""Returns the grounding, and figures of how good it is and how fast it was fitted."""
+Fit = Callable[[Fitting], tuple[FittedGrounding, dict[str, Any]]]  # returns also figures of how good and fast it was
 
 
 @dataclass(frozen=True)
@@ -195,9 +195,6 @@ def _held_out_error(model: GroundingModel, episodes: PairedEpisodes, weights: Lo
     """Return the losses of correction and reward on whole `episodes`; latents have no scale to compare."""
     loss, _ = model.losses(episodes.windows, replace(weights, latent=0.0))
     return float(loss)
-
-
-_CLOSEST_SHARE = 0.01  # of the recorded steps: those that were closer to a wall are not what a robot can rely on
 
 
 def recorded_clearance_m(task: Task, episodes: PairedEpisodes) -> float | None:

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from astra_data.core.checkpoint import as_part, loaded, part_of
 from astra_data.core.seeding import derive
 from astra_data.grounding.descent import Descent, DescentConfig
-from astra_data.grounding.encoder import HistoryEncoder, mlp
+from astra_data.grounding.encoder import mlp
 from astra_data.grounding.failures import FailureModel, FailureShape
 from astra_data.grounding.model import GroundingModel, GroundingShape
 from astra_data.grounding.paired_episodes import PairedEpisodes, PairedWindows
@@ -18,6 +18,10 @@ from astra_data.grounding.simulator import EpisodeSimulator, FittedGrounding
 from astra_data.worlds.protocols import PlacedSimulator, keep_clear
 
 _MOST = 2.0  # of the logarithm of a scale: off the data no moment shall scatter by more than e² times the usual
+_DESCENT = DescentConfig(updates=500, learning_rate=2e-3)
+_BATCH = 2048
+_MOST_FORMS = 20_000
+_FAILURES, _SCATTER = "failures", "scatter"  # prefixes of the tensors and sizes of the two models in files
 
 
 @dataclass(frozen=True)
@@ -63,11 +67,6 @@ class ScatterModel(nn.Module):
         return forms * self.usual * self.log_scale(inputs).exp()
 
 
-_DESCENT = DescentConfig(updates=500, learning_rate=2e-3)
-_BATCH = 2048
-_MOST_FORMS = 20_000
-
-
 def fit_scatter(
     model: GroundingModel, training: PairedEpisodes, held_out: PairedEpisodes, seed: int
 ) -> tuple[ScatterModel, dict[str, Any]]:
@@ -108,10 +107,6 @@ def _residuals(model: GroundingModel, episodes: PairedEpisodes) -> tuple[Tensor,
 def _deviation(values: Tensor) -> Tensor:
     """Return the root mean square (X,) of values (N, X)."""
     return values.square().mean(0).sqrt()
-
-
-_FAILURES, _SCATTER = "failures", "scatter"
-"""Prefixes of the tensors and sizes of a failure model and of a scatter model in files."""
 
 
 class GroundedSimulator(EpisodeSimulator):
@@ -222,8 +217,7 @@ class HistoryGrounding(FittedGrounding):
 
     model: GroundingModel
     failures: FailureModel | None = None
-    clearance_m: float | None = None
-    """How close to walls corrections may end; None for as close as the simulator itself."""
+    clearance_m: float | None = None  # of corrections from walls; None for as close as the simulator itself
     scatter_model: ScatterModel | None = None  # of the target around the correction, if one was fitted
     fails_at_walls: bool = False
     """Whether touching a wall is a failure. Then the correction touches it, not the scatter, which holds the
@@ -253,8 +247,6 @@ class HistoryGrounding(FittedGrounding):
         """Return weights and sizes."""
         tensors = self.model.state_dict()
         metadata: dict[str, Any] = {"shape": asdict(self.model.shape), "fails_at_walls": self.fails_at_walls}
-        if self.model.shape.encoder == HistoryEncoder.kind:
-            del metadata["shape"]["encoder"]
         for part, model in ((_FAILURES, self.failures), (_SCATTER, self.scatter_model)):
             if model is not None:
                 tensors |= as_part(model.state_dict(), part)

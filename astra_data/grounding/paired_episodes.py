@@ -21,6 +21,10 @@ from astra_data.worlds.commands import Commands
 from astra_data.worlds.task import Task
 
 RISK_STEPS = 20  # steps before each failure that `PairedWindows.fails_soon` marks
+_COLUMNS = (
+    *(names.STATE, names.ACTION, names.TERMINATED),
+    *(names.ABSTRACT_STATE, names.ABSTRACT_NEXT_STATE, names.ABSTRACT_SIMULATED_NEXT_STATE),
+)
 
 
 @dataclass(frozen=True)
@@ -63,12 +67,6 @@ def draw_steps(lengths: Tensor, count: int, length: int) -> tuple[Tensor, Tensor
     first = drawn.clamp_min(0).minimum((lengths[episodes] - length).clamp_min(0))
     steps = first[:, None] + torch.arange(length, device=first.device)
     return episodes[:, None], steps, (steps >= drawn[:, None]) & (steps < drawn[:, None] + length)
-
-
-_COLUMNS = (
-    *(names.STATE, names.ACTION, names.TERMINATED),
-    *(names.ABSTRACT_STATE, names.ABSTRACT_NEXT_STATE, names.ABSTRACT_SIMULATED_NEXT_STATE),
-)
 
 
 @dataclass(frozen=True)

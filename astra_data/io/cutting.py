@@ -32,8 +32,7 @@ _SHOWN = 8  # fields and files that are listed
 _KINDS = {"U": "text", "S": "text", "O": "values that are not numbers, such as missing ones"}
 
 Cut = tuple[dict[str, Array], dict[str, Scalar]]  # the columns and the metadata of an episode
-Table = dict[str, Array]
-"""Rows: columns by name and, by words that begin with "/" as no column does, what decides their cuts."""
+Table = dict[str, Array]  # columns by name, and what decides cuts, by words that begin with "/" as no column does
 
 
 @dataclass
@@ -42,8 +41,7 @@ class Tally:
 
     rows: int = 0
     rejected_rows: int = 0  # those with a value that is not finite, and torn ones
-    not_finite: dict[str, tuple[int, str]] = field(default_factory=dict)
-    """Field to how many rows it is not finite in, and where the first is."""
+    not_finite: dict[str, tuple[int, str]] = field(default_factory=dict)  # field: count of rows, where the first is
     bad_episodes: list[str] = field(default_factory=list)  # those that are left out for such a row, in a line each
     torn_rows: int = 0  # those that are cut off at the end of their files
     torn_first: str = ""
@@ -61,8 +59,7 @@ class Tally:
     clock: str = ""  # the recorded rate, gaps and jitter, where the mapping names the times
     unused_fields: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)  # what is strange about the rates of files, in a line each
-    topics: dict[str, list[str]] = field(default_factory=dict)
-    """What is strange about topics, in a line each, with the files that it is true of."""
+    topics: dict[str, list[str]] = field(default_factory=dict)  # strange about topics, a line each: its files
 
     @property
     def faults(self) -> str:

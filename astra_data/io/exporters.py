@@ -19,10 +19,8 @@ from astra_data.dataset.reader import Dataset
 from astra_data.io.hdf5_file import D3RLPY, D4RL, MINARI, ROBOMIMIC
 
 NEEDED = (STATE, ACTION, TERMINATED, TRUNCATED, NEXT_STATE)  # columns that every format needs
-VECTORS = (STATE, NEXT_STATE, GOAL, ACTION)
-"""Columns that are vectors in every format, (T, size), also those of one value per step."""
-VALID_SHARE = 0.1
-"""Share of the recordings in robomimic's mask/valid, as in its own split; the others are in mask/train."""
+VECTORS = (STATE, NEXT_STATE, GOAL, ACTION)  # (T, size) in every format, also with one value per step
+VALID_SHARE = 0.1  # of the recordings, in robomimic's mask/valid, as in its own split; the others are in mask/train
 
 _log = logging.getLogger(__name__)
 

@@ -32,8 +32,7 @@ FLAGS: dict[Role, str] = {
     r"crash(ed)?|colli(sion|ded)|bump(ed|er)?|e_?stop|stuck|fault|terminated",
     "success": r"success|succeeded|(goal_)?reached|at_goal|arrived|delivered|docked|parked|solved",
 }
-UNCLEAR = re.compile(r"done|ended|truncated|timeout")
-"""Ends of which the name does not tell whether they are successes, failures or neither."""
+UNCLEAR = re.compile(r"done|ended|truncated|timeout")  # successes, failures or neither: the name does not tell
 COMMANDED = "cmd|command|action|act|ctrl|control|setpoint|sp|desired|des|target|ref"
 COMMAND_WORD = re.compile(rf"(^|_)({COMMANDED}|u)(_|(?=\d)|$)")
 COMMAND, TORQUE, FORCE = (

@@ -26,8 +26,7 @@ ROBOMIMIC = {ACTION: "actions", REWARD: "rewards", TERMINATED: "dones", TRUNCATE
 D3RLPY = {STATE: "observations", ACTION: "actions", REWARD: "rewards", TERMINATED: "terminated"}
 """Per episode, with its number at the end of the name; `terminated` is a single value."""
 MINARI = {ACTION: "actions", REWARD: "rewards", TERMINATED: "terminations", TRUNCATED: "truncations"}
-NUMBERED = "{field}_{number}"
-"""The pattern of episodes whose fields have the episode's number at the end of their names."""
+NUMBERED = "{field}_{number}"  # the pattern of episodes whose fields end with the number of the episode
 
 MOST_COMPRESSED = 10_000  # larger than the compression ratio of any filter; beyond it, the values were never written
 

@@ -50,8 +50,7 @@ class ImportReport:
     frames: int
     tally: Tally
     wall_seconds: float
-    unused: tuple[str, ...] = ()
-    """The files of which no episode was made; `unread` are those of other endings than the format's."""
+    unused: tuple[str, ...] = ()  # files of which no episode was made; `unread`: of other endings than the format's
     unread: tuple[str, ...] = ()
     left_out: tuple[str, ...] = ()  # what is wrong with each file that was left out
     taken: str = ""  # which fields became which columns, where no mapping says so
@@ -108,19 +107,10 @@ def import_dataset(
 ) -> ImportReport:
     """Turn recordings into one dataset; at most the rows of one file are in memory at once.
 
-    Args:
-        recordings: files, folders or archives of one format.
-        mapping: the file that says which fields become which columns; D4RL, robomimic, d3rlpy, Minari
-            and PACE need none.
-        out: the dataset's folder, by default its place at home.
-        file_format: one of `FORMATS`, by default inferred from the recordings' names.
-        name: of the dataset; like `fps` and `task`, it overrides the mapping.
-        fps: steps per second.
-        task: what the episodes do.
-        max_bytes: the most bytes of values that are taken from the recordings, eight a value; by default 100
-            times the size of the files, or 256 MiB if that is more.
-        skip_bad: leave out files and episodes that cannot be imported, which the report and the dataset's
-            description list; with a mapping only.
+    Recordings are files, folders or archives of one of `FORMATS`. The file `mapping` says which fields become which
+    columns; D4RL, robomimic, d3rlpy, Minari and PACE need none. `name`, `fps` and `task` override it. At most
+    `max_bytes` of values are taken, eight a value, by default 100 times the size of the files, or 256 MiB if that is
+    more. With `skip_bad`, files and episodes that cannot be imported are left out, which the report lists.
     """
     began = time.perf_counter()
     options = only_given(name=name, fps=fps, task=task, format=file_format)

@@ -20,11 +20,29 @@ from astra_data.io.mapping import ImportMapping
 
 VALUE_BYTES = 8  # what a value is counted as, whatever its type
 SMALL_BYTES = 2**28  # values of so many bytes are taken from recordings of any size
-MOST_UNPACKED = 100
-"""Larger than what logs of a robot are compressed by; files made to fill a memory are compressed by more."""
+MOST_UNPACKED = 100  # logs of a robot are compressed by less; files made to fill a memory by more
 
 ARCHIVES = (".tar", ".tar.gz", ".tgz", ".tar.bz2", ".tar.xz")
 IN_ARCHIVES = ("csv", "json")  # formats that are read sequentially, so that they can be read inside archives
+ZARR = (".zgroup", ".zarray", ".zattrs", "zarr.json")
+FOREIGN = {
+    (".npy",): "a NumPy array without a name: save it beside others under names, numpy.savez('log.npz', "
+    "state=..., action=...), and import that",
+    (".db3", ".db3.zstd"): "a bag of ROS 2 in SQLite, expected MCAP: write `output_bags: [{uri: NEW, "
+    "storage_id: mcap, all: true}]` to a file new.yaml, run `ros2 bag convert -i BAG -o new.yaml`, and "
+    "import NEW",
+    (".gz", ".bz2", ".xz", ".zst", ".zstd", ".zip", ".7z"): "compressed: unpack it (gunzip, bunzip2, unxz, "
+    "unzstd, unzip)",
+    (".bag",): "a bag of ROS 1: run `uvx --from rosbags rosbags-convert --src FILE --dst NEW --dst-storage "
+    "mcap`, and import NEW with a mapping like recipes/imports/ros2_base.toml",
+    (".ulg",): "a log of PX4: run `uvx --from pyulog ulog2csv FILE`, and import the folder of its CSVs, "
+    'joined by time (fields such as "vehicle_odometry_0.csv:q[0]", time = "timestamp", time_scale = 1e-6)',
+    ZARR: "Zarr: save its arrays by numpy.savez('log.npz', **{name: array[:] for name, array in "
+    "zarr.open(FOLDER).arrays()}), and import that",
+    (".pkl", ".pickle", ".joblib"): "a pickle, which is code and never run: load it where you trust it, and "
+    "numpy.savez its arrays",
+    (".xlsx", ".xls", ".ods"): "a spreadsheet: save it as CSV",
+}  # endings of files that are not read, and what they are and what to do
 
 
 @dataclass(frozen=True)
@@ -94,8 +112,7 @@ class Block:
     is_back: bool = False  # whether that episode begins since time goes back
     places: Mapping[int, str] = field(default_factory=dict)
     """Where the values of some rows were recorded, if the number of the row does not tell."""
-    line: Callable[[int], int] | None = None
-    """Gives the line of a row of the file by its number, where lines may be empty."""
+    line: Callable[[int], int] | None = None  # of a row of the file by its number, where lines may be empty
     known: Collection[str] = ()  # the fields, or topics, that this part of the file has
     row: int = 0  # the number of the first row in that part
 
@@ -109,27 +126,6 @@ class Block:
     def row_name(self, number: int) -> str:
         """Name the row, or the cut off one after the last, that has a `number` in its part of the file."""
         return f"{self.origin} line {self.line(number)}" if self.line else f"{self.origin} row {number}"
-
-
-ZARR = (".zgroup", ".zarray", ".zattrs", "zarr.json")
-FOREIGN = {
-    (".npy",): "a NumPy array without a name: save it beside others under names, numpy.savez('log.npz', "
-    "state=..., action=...), and import that",
-    (".db3", ".db3.zstd"): "a bag of ROS 2 in SQLite, expected MCAP: write `output_bags: [{uri: NEW, "
-    "storage_id: mcap, all: true}]` to a file new.yaml, run `ros2 bag convert -i BAG -o new.yaml`, and "
-    "import NEW",
-    (".gz", ".bz2", ".xz", ".zst", ".zstd", ".zip", ".7z"): "compressed: unpack it (gunzip, bunzip2, unxz, "
-    "unzstd, unzip)",
-    (".bag",): "a bag of ROS 1: run `uvx --from rosbags rosbags-convert --src FILE --dst NEW --dst-storage "
-    "mcap`, and import NEW with a mapping like recipes/imports/ros2_base.toml",
-    (".ulg",): "a log of PX4: run `uvx --from pyulog ulog2csv FILE`, and import the folder of its CSVs, "
-    'joined by time (fields such as "vehicle_odometry_0.csv:q[0]", time = "timestamp", time_scale = 1e-6)',
-    ZARR: "Zarr: save its arrays by numpy.savez('log.npz', **{name: array[:] for name, array in "
-    "zarr.open(FOLDER).arrays()}), and import that",
-    (".pkl", ".pickle", ".joblib"): "a pickle, which is code and never run: load it where you trust it, and "
-    "numpy.savez its arrays",
-    (".xlsx", ".xls", ".ods"): "a spreadsheet: save it as CSV",
-}  # endings of files that are not read, and what they are and what to do
 
 
 def foreign(names: Sequence[str]) -> str:

@@ -16,10 +16,8 @@ from astra_data.worlds.task import Task, names_with_units
 
 KEYS = {"s": "success", "f": "failure", "v": "void"}
 QUIT = "q"
-Ask = Callable[[str], str]
-"""Given what to do in the next trial, returns one of `KEYS`, or `QUIT` to leave it for later."""
-Trial = tuple[str, ...]
-"""A line of the sheet before its result: number of the round and within it, policy, start and goal."""
+Ask = Callable[[str], str]  # given what to do in the next trial, returns one of `KEYS`, or `QUIT` to leave it for later
+Trial = tuple[str, ...]  # a line of the sheet before its result: round and number in it, policy, start and goal
 
 
 class Sheet:

@@ -16,8 +16,7 @@ from astra_data.core.naming import stage_of_key
 from astra_data.core.progress import Progress as Notes
 from astra_data.pipeline.executors import Event, Watch
 
-SLOW_STAGES = ("ground", "train", "align")
-"""Stages that take most of a run: until it is known how long their items take, no time left is shown."""
+SLOW_STAGES = ("ground", "train", "align")  # until it is known how long these take, no time left is shown
 _BAR_WIDTH = 20
 
 

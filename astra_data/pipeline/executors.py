@@ -36,6 +36,11 @@ Note = tuple[float, str]  # the fraction of an item that is done, and a remark
 Outcome = float | AstraDataError  # how long an item took, in s, or how it failed
 Event = Outcome | Note | None  # what happened to an item: it ended, or went on, or None: it started
 Watch = Callable[[str, Event], None]  # is called with the key of an item and what happened to it
+GPU_SHARE = 0.5  # share of a GPU for an item that computes on one: two of them keep their CUDA contexts on one GPU
+SETTINGS = {"RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0", "RAY_USAGE_STATS_ENABLED": "0", "RAY_worker_niceness": "0"}
+"""Otherwise Ray makes `uv run` build an environment for every worker, sends usage statistics, and runs
+its workers at a lower priority than every other process."""
+PATIENCE_S = 10  # how long to wait for canceled tasks
 
 
 @dataclass(frozen=True)
@@ -182,10 +187,6 @@ def execute(
 
     When an item fails, at Ctrl-C or SIGTERM, or when this process is killed, the others are stopped.
     What an item prints goes to `<key>.txt` in `logs`. `prepare` is called in the process of an item before it.
-
-    Raises:
-        AstraDataError: an item's own error, after its key, or where its traceback is when it crashed.
-        KeyboardInterrupt: at Ctrl-C or SIGTERM.
     """
     jobs = jobs or (CUDA_JOBS if any(item.wants_gpu for item in items) else cores())
     counts = Counter(item.stage for item in items)
@@ -284,13 +285,6 @@ def _serve(connection: Connection, _imported: Callable[[], object] | None) -> No
         connection.send(run_item(key, work, log, connection.send))
 
 
-GPU_SHARE = 0.5  # share of a GPU for an item that computes on one: two of them keep their CUDA contexts on one GPU
-SETTINGS = {"RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0", "RAY_USAGE_STATS_ENABLED": "0", "RAY_worker_niceness": "0"}
-"""Otherwise Ray makes `uv run` build an environment for every worker, sends usage statistics, and runs
-its workers at a lower priority than every other process."""
-PATIENCE_S = 10  # how long to wait for canceled tasks
-
-
 def execute_on_cluster(
     items: Collection[Item],
     *,
@@ -326,7 +320,7 @@ def execute_on_cluster(
 
     def events() -> Iterator[tuple[str, Event]]:
         done, _ = ray.wait(list(running), timeout=SECONDS_BETWEEN_NOTES)
-        yield from ray.get(mailbox.take.remote())
+        yield from mailbox.get_nowait_batch(mailbox.qsize())
         for begun in done:
             key = running.pop(begun)
             try:
@@ -337,7 +331,7 @@ def execute_on_cluster(
     try:
         if any(item.wants_gpu for item in items) and not ray.cluster_resources().get("GPU"):
             raise BadInputError(f"the Ray cluster at {address} has no GPU: use --device cpu")
-        mailbox = ray.remote(num_cpus=0)(_Mailbox).remote()
+        mailbox = optional("ray.util.queue").Queue(actor_options={"num_cpus": 0})  # the notes of tasks
         task = ray.remote(num_cpus=1, max_retries=0)(_work)
         run_in_order(items, jobs, watch, begin, events)
     except (ray.exceptions.RayError, ConnectionError) as error:
@@ -351,22 +345,7 @@ def execute_on_cluster(
         ray.shutdown()
 
 
-class _Mailbox:
-    """An actor that keeps the notes of tasks, None of one that starts, until they are fetched."""
-
-    def __init__(self) -> None:
-        self._notes: list[tuple[str, Note | None]] = []
-
-    def put(self, key: str, note: Note | None) -> None:
-        self._notes.append((key, note))
-
-    def take(self) -> list[tuple[str, Note | None]]:
-        notes, self._notes = self._notes, []
-        return notes
-
-
 def _work(key: str, work: bytes, log: Path, here: tuple[Path, list[str]], mailbox: Any) -> Outcome:  # noqa: ANN401 - Ray's
-    ray = sys.modules["ray"]
     folder, modules = here
     try:
         os.chdir(folder)
@@ -377,7 +356,7 @@ def _work(key: str, work: bytes, log: Path, here: tuple[Path, list[str]], mailbo
     sys.path.extend(place for place in modules if place not in sys.path)
 
     def send(note: Note | None) -> None:
-        ray.get(mailbox.put.remote(key, note))  # waits, so that every note has arrived when the task ends
+        mailbox.put((key, note))  # waits, so that every note has arrived when the task ends
 
     send(None)
     return run_item(key, work, log, send)

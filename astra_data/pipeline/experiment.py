@@ -21,7 +21,7 @@ from astra_data.core.durable import begun_beside, write_file
 from astra_data.core.errors import AstraDataError, BadInputError, RecipeError
 from astra_data.core.naming import first_few, shortened, stage_of_key
 from astra_data.dataset.columns import ABSTRACT_STATE, ACTION
-from astra_data.dataset.compare import hashes, lineage
+from astra_data.dataset.compare import lineage
 from astra_data.dataset.description import changed_values, read_description
 from astra_data.dataset.edit import share
 from astra_data.dataset.reader import Dataset
@@ -41,6 +41,8 @@ from astra_data.worlds.commands import Commands
 ALWAYS_NEW = {"report"}  # made by every run: it is cheap, and shows the rows and seeds that the recipe has now
 MADE_WITH = "made_with"  # the folder of a run for what its artifacts were made with
 _MOST_KEYS, _MOST_LETTERS = 3, 60
+BEYOND = 0.05  # share of the recorded range by which bounds may be wider without a warning
+TIMES = 20  # how many times as wide as the bounds the recorded range may be without a warning
 
 
 @dataclass(frozen=True)
@@ -264,10 +266,6 @@ def _check_fit(recipe: Recipe, base: Experiment, path: Path) -> None:
         raise RecipeError(f"{path} does not fit what it is based on: {'; '.join(faults)}")
 
 
-BEYOND = 0.05  # share of the recorded range by which bounds may be wider without a warning
-TIMES = 20  # how many times as wide as the bounds the recorded range may be without a warning
-
-
 @dataclass(frozen=True)
 class Condition:
     """The condition of an artifact, why, and warnings of its content, where there is something to say."""
@@ -334,7 +332,7 @@ def _replaced(item: Item, experiment: Experiment, made_from: Mapping[str, str]) 
             named, made = open_dataset(data), read_description(experiment.place(item.key))
             known = {made["content_hash"], *(parent["hash"] for parent in made["parents"])}
             # What was made of it since, and has its name, is no other.
-            if not known & hashes(lineage(named)):
+            if known.isdisjoint(content_hash for *_, content_hash in lineage(named)):
                 return f"made from another dataset than {named.reference}"
     for key in item.inputs:
         # A choice is among the policies that the recipe has now.

@@ -13,6 +13,7 @@ import inspect
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -28,25 +29,10 @@ from astra_data.pipeline.recipe import Recipe
 from astra_data.pipeline.stages.registry import STAGES, Stage
 from astra_data.pipeline.stages.select import benches, judge_of
 from astra_data.pipeline.user_code import digests_of
-from astra_data.reports.runs import Reported
+from astra_data.reports.runs import Owner, Reported
 from astra_data.robots.registry import task_named
 
-ARTIFACTS = ("dataset", "policy", "grounding", "target_encoder", "reference", "initial")
-"""Parameters of stages that are folders of artifacts."""
-
-
-@dataclass(frozen=True)
-class RunPoint:
-    """A row on the dataset of one seed, or on one size of it: the unit of training and evaluation."""
-
-    method: str
-    seed: int
-    percent: int | None
-
-    @property
-    def key(self) -> str:
-        """Key of its evaluation, the last artifact to be made for it."""
-        return artifact_key("evaluate", self.method, self.seed, self.percent)
+ARTIFACTS = ("dataset", "policy", "grounding", "target_encoder", "reference", "initial")  # folders, as parameters
 
 
 @dataclass(frozen=True)
@@ -77,14 +63,11 @@ class Selection:
             tuple(dict.fromkeys(percents)) or sizes,
         )
 
-    def points(self) -> tuple[RunPoint, ...]:
-        """Return every row on every size of every seed."""
-        return tuple(
-            RunPoint(method, seed, percent)
-            for method in self.methods
-            for percent in self.percents or (None,)
-            for seed in self.seeds
-        )
+    def points(self) -> dict[str, Owner]:
+        """Return every row on every size of every seed, by the key of its evaluation, which is made last."""
+        points = product(self.methods, self.percents or (None,), self.seeds)
+        owners = [Owner(row, seed, percent) for row, percent, seed in points]
+        return {artifact_key("evaluate", *owner): owner for owner in owners}
 
 
 def plan(
@@ -100,7 +83,7 @@ def plan(
     """Return every artifact of the `recipe` at `path`, each after those it reads, seed after seed, and its report."""
     selection = selection or Selection.of(recipe)
     items = list(_Plan(recipe, folder, selection, device).items())
-    keys = tuple(point.key for point in selection.points())
+    keys = tuple(selection.points())
     rows, seeds, percents = selection.methods, selection.seeds, selection.percents
     reported = Reported(
         name=path.stem, task=recipe.task, methods=rows, seeds=seeds, percents=percents, settings=in_full(recipe)

@@ -1,6 +1,7 @@
 """Run recipes: make every artifact that is not finished yet; `sweep.csv` has a line per finished evaluation."""
 
 import csv
+import json
 import logging
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -16,7 +17,7 @@ from rich.console import Console
 from astra_data.core.config import did_you_mean
 from astra_data.core.durable import alone_in, clean, folder_for, make_folder, move, write_file
 from astra_data.core.errors import BadInputError, MissingStageError, optional
-from astra_data.core.naming import RECORD, RUNS, artifact_key, reference_of, row_of_key, stage_of_key
+from astra_data.core.naming import CODE, RECORD, RUNS, artifact_key, reference_of, row_of_key, stage_of_key
 from astra_data.grounding.diagnosis import diagnose
 from astra_data.methods import grounded_as, method_named
 from astra_data.pipeline.display import display, shown
@@ -30,14 +31,15 @@ from astra_data.pipeline.experiment import (
     load_experiment,
     to_make_again,
 )
-from astra_data.pipeline.plan import RunPoint, Selection, check_stage, plan, stages_until
+from astra_data.pipeline.plan import Selection, check_stage, plan, stages_until
 from astra_data.pipeline.recipe import WHOLE
 from astra_data.pipeline.stages.registry import STAGES
 from astra_data.pipeline.stages.report import is_current
-from astra_data.pipeline.user_code import UserMethod, add_all, digests_of, record_code
+from astra_data.pipeline.user_code import UserMethod, add_all, digests_of
 from astra_data.reports.artifacts import CURVE, EVALUATION, METRICS, Artifact, Evaluation, read_json
 from astra_data.reports.diagnosis import DIAGNOSIS, diagnosis_page
 from astra_data.reports.held_out import write_held_out
+from astra_data.reports.runs import Owner, recorded_code
 from astra_data.robots.registry import TASKS, task_named
 from astra_data.worlds.walk_through import check_task
 
@@ -207,7 +209,7 @@ def make(
     device: str = "cpu",
     engine: str = "processes",
     address: str | None = None,
-    table: tuple[Collection[RunPoint], Callable[[dict[str, Any]], object]] | None = None,
+    table: tuple[Mapping[str, Owner], Callable[[dict[str, Any]], object]] | None = None,
 ) -> None:
     """Make those of an experiment's `items` that are not finished yet, damaged or stale.
 
@@ -222,8 +224,10 @@ def make(
         clean(folder)
         again = to_make_again(items, experiment)
         items = [one for one in items if one.key in again or one.stage in ALWAYS_NEW or not experiment.has(one.key)]
-        if [item.stage for item in items] == ["report"] and _is_reported(items[0]):
-            items = []
+        if [item.stage for item in items] == ["report"]:
+            call: Any = items[0].call
+            is_there = call.keywords["publish"] is None and is_current(*call.args, **call.keywords)
+            items = [] if is_there else items
         data = data_condition(recipe) if any(item.stage == "label" for item in items) else None
         _check_inputs(experiment, items, planned)
         experiment.link_borrowed()
@@ -234,18 +238,19 @@ def make(
         for key, reason in again.items():
             show(f"{key} is recreated: {reason}; the old one is in {set_aside(folder, key)}")
         write_file(folder / RECORD, recipe.model_dump_json(indent=2) + "\n")
-        record_code(folder, digests_of(recipe.task, recipe.own_methods))
+        if digests := digests_of(recipe.task, recipe.own_methods):
+            write_file(folder / CODE, json.dumps(recorded_code(folder) | digests, indent=1) + "\n")
         experiment.write_made_with(items)
-        points, log = table or ((), lambda _: None)
+        points, log = table or ({}, lambda _: None)
         if table:
             _write_points(experiment)
 
         def finished(key: str) -> None:
-            for point in (one for one in points if one.key == key):
+            if key in points:
                 lines, headline = _write_points(experiment), recipe.headline
-                done = f"{sum(one in lines for one in points)} of {len(points)} points"
-                show(f"{key}  done {headline.text(lines[point][headline.measure])}  ({done})")
-                log(lines[point])
+                done = f"{len(points.keys() & lines)} of {len(points)} points"
+                show(f"{key}  done {headline.text(lines[key][headline.measure])}  ({done})")
+                log(lines[key])
 
         with display([item.key for item in items], console, finished) as watch:
             EXECUTORS[engine](
@@ -256,12 +261,6 @@ def make(
                 prepare=partial(_prepare, dict(recipe.own_methods)),
                 address=address,
             )
-
-
-def _is_reported(item: Item) -> bool:
-    """Return whether the report is there already, made of what it would be made of."""
-    call: Any = item.call
-    return call.keywords["publish"] is None and is_current(*call.args, **call.keywords)
 
 
 def _prepare(own_methods: dict[str, UserMethod]) -> None:
@@ -312,10 +311,10 @@ def _selected(items: tuple[Item, ...], stage: str, methods: Sequence[str]) -> li
     return [item for item in selected if not rows or row_of_key(item.key) in rows]
 
 
-def _write_points(experiment: Experiment) -> dict[RunPoint, dict[str, Any]]:
+def _write_points(experiment: Experiment) -> dict[str, dict[str, Any]]:
     """Write the lines of all points that are finished now, if there are any, to `sweep.csv`, and return them."""
-    points = Selection.of(experiment.recipe).points()
-    lines = {one: _line(experiment, one) for one in points if (experiment.folder / one.key).is_dir()}
+    points = Selection.of(experiment.recipe).points().items()
+    lines = {key: _line(experiment, key, one) for key, one in points if (experiment.folder / key).is_dir()}
     if lines:
         text = StringIO()
         writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
@@ -325,16 +324,16 @@ def _write_points(experiment: Experiment) -> dict[RunPoint, dict[str, Any]]:
     return lines
 
 
-def _line(experiment: Experiment, point: RunPoint) -> dict[str, Any]:
-    evaluation = read_json(Evaluation, experiment.folder / point.key / EVALUATION)
+def _line(experiment: Experiment, key: str, point: Owner) -> dict[str, Any]:
+    evaluation = read_json(Evaluation, experiment.folder / key / EVALUATION)
     means, simulated = evaluation.outcomes.means(), evaluation.simulated
-    stages = {key: stage_of_key(key) for key in sorted(set(_needed(point.key, experiment.items)))}
-    timed = [experiment.folder / key / TIMED[stage] for key, stage in stages.items() if stage in TIMED]
+    stages = {made: stage_of_key(made) for made in sorted(set(_needed(key, experiment.items)))}
+    timed = [experiment.folder / made / TIMED[stage] for made, stage in stages.items() if stage in TIMED]
     # The artifacts that a point was made of may have been deleted since.
     is_complete = all(file.is_file() for file in timed)
     seconds = [read_json(Artifact, file).wall_seconds or 0.0 for file in timed] if is_complete else []
     return {
-        "method": point.method,
+        "method": point.row,
         "percent": WHOLE if point.percent is None else point.percent,
         "seed": point.seed,
         **{measure: means[measure] for measure in ("success", "steps", "return", "failed")},

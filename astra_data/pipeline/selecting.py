@@ -26,6 +26,7 @@ from astra_data.pipeline.trained_policy import settings_of, trained_policy
 from astra_data.pipeline.user_code import add_all
 from astra_data.policies.episodes import in_target, started
 from astra_data.reports import choice
+from astra_data.reports.artifacts import read_json
 from astra_data.reports.runs import Reported
 from astra_data.robots.registry import task_named
 
@@ -124,14 +125,11 @@ def choose_by_trials(
         raise BadInputError(f"expected two candidates or more to try, {of}: give another --field, or more rows")
     field = field or choice.widest_field(len(candidates), trials)
     begun = choice.TrialsFile(
-        trials=trials,
-        field=field,
-        percent=percent,
-        by_hand=by_hand is not None,
-        pseudo_trials=choice.PSEUDO_TRIALS,
+        trials=trials, field=field, percent=percent, by_hand=by_hand is not None, pseudo_trials=choice.PSEUDO_TRIALS
     )
     path = folder / choice.FOLDER / choice.TRIALS
-    if there := choice.read_trials(path):
+    there = read_json(choice.TrialsFile, path) if path.is_file() else None
+    if there:
         for name, now in begun.model_dump(include={"trials", "field", "percent", "by_hand", "pseudo_trials"}).items():
             if (was := getattr(there, name)) != now:
                 raise BadInputError(

@@ -1,6 +1,5 @@
 """The code of the user's that a recipe names: methods, by a place or a table of the place and settings."""
 
-import json
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
@@ -8,9 +7,8 @@ from typing import Any
 from pydantic import ConfigDict, model_validator
 
 from astra_data.core.config import Config, validated
-from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError, RecipeError
-from astra_data.core.naming import CODE, base_method
+from astra_data.core.naming import base_method
 from astra_data.methods import METHODS, add_method, is_of_package, offered_methods
 from astra_data.reports.runs import recorded_code
 from astra_data.robots.registry import place_of
@@ -88,12 +86,6 @@ def check_unchanged(place: str, run: Path, *, name: str = "task") -> None:
             f"{place.rpartition(':')[0]} changed since {run} was made: "
             "restore that version, or run the recipe under another name"
         )
-
-
-def record_code(folder: Path, digests: Mapping[str, str]) -> None:
-    """Write in `folder` the digests of "task" and of methods by their names; others there stay."""
-    if digests:
-        write_file(folder / CODE, json.dumps(recorded_code(folder) | dict(digests), indent=1) + "\n")
 
 
 def digests_of(task: str, own_methods: Mapping[str, UserMethod]) -> dict[str, str]:

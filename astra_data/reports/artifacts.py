@@ -79,17 +79,14 @@ class Evaluation(Artifact):
     dataset_version: str | None = None
     dataset_hash: str | None = None
     target_steps_per_second: float | None = None
-    tested_in: Literal["target", "grounded", "raw"] = "target"
-    """Where the row was tested: a simulator, if the task has no target."""
+    tested_in: Literal["target", "grounded", "raw"] = "target"  # a simulator, if the task has no target
     target: Outcomes | None = None
     simulated: Outcomes | None = None  # in the simulator that the policy was trained in; None if it was trained in none
     raw: Outcomes | None = None  # in the raw simulator; None for a policy that cannot act on abstract states
     grounded: Outcomes | None = None  # in the reference grounded simulator; None if there is none, or likewise
-    beyond_recorded: float | None = None
-    """Share of the steps, where the row was tested, whose command is beyond the range of its dataset."""
+    beyond_recorded: float | None = None  # share of tested steps whose command is beyond the dataset's range
     encoder: str | None = None  # which one its figures in the target are of; None for a hand-written row
-    encoders: dict[str, dict[str, float]] = Field(default_factory=dict)
-    """Mean of each measure by encoder, if there is more than one."""
+    encoders: dict[str, dict[str, float]] = Field(default_factory=dict)  # mean of each measure, if there are several
 
     @property
     def outcomes(self) -> Outcomes:

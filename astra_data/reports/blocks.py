@@ -69,11 +69,6 @@ def listed(words: Sequence[str]) -> str:
     return " and ".join(filter(None, (", ".join(words[:-1]), *words[-1:])))
 
 
-def code(text: str) -> str:
-    """Return a text of anybody's as code that ends nowhere within it."""
-    return f"`{' '.join(text.replace('`', '').split())}`"
-
-
 def short(rate: float) -> str:
     """Return a rate with three significant digits, in thousands from 1000 on, then in millions."""
     for unit, size in (("M", 1e6), ("k", 1e3)):

@@ -104,11 +104,6 @@ class TrialsFile(Artifact):
         return sum(len(one.success) for round_ in self.rounds for one in round_.tried)
 
 
-def read_trials(path: Path) -> TrialsFile | None:
-    """Read trials.json; None if it is not there; raise a BadInputError if it is malformed."""
-    return read_json(TrialsFile, path) if path.is_file() else None
-
-
 def read_judged(root: Path) -> "Judged | None":
     """Read what the stage `select` left in a run's folder; None if it was not run."""
     path = root / FOLDER / SELECTED
@@ -149,8 +144,7 @@ class Judgment(WrittenPart):
 
     judge: str  # the method whose groundings judge
     episodes: int = Field(ge=1)  # of each candidate with each judge
-    shares_episodes: bool = False
-    """Whether the judges were fitted to the candidates' own episodes: all seeds have the same `data`."""
+    shares_episodes: bool = False  # whether judges were fitted to the same episodes: all seeds have the same `data`
     candidates: list[Candidate] = Field(min_length=1)
 
     @property

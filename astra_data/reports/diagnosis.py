@@ -3,8 +3,9 @@
 import numpy as np
 
 from astra_data.core.arrays import Floats
+from astra_data.core.naming import in_code
 from astra_data.grounding.diagnosis import Diagnosis, with_ends
-from astra_data.reports.blocks import Section, TableBlock, Text, code, markdown
+from astra_data.reports.blocks import Section, TableBlock, Text, markdown
 from astra_data.reports.statistics import Estimate, interval
 
 DIAGNOSIS = "diagnosis.md"
@@ -23,8 +24,8 @@ def diagnosis_page(recipe: str, found: Diagnosis, timestep_s: float) -> str:
         for one in found.missed
     ]
     about = Text(
-        f"What {code(found.reference)} ({found.recordings} recordings, {found.steps} steps) and the abstract simulator "
-        "say before anything is fitted."
+        f"What {in_code(found.reference)} ({found.recordings} recordings, {found.steps} steps) and the abstract "
+        "simulator say before anything is fitted."
     )
     given = [[name, *(f"{value:.3g}" for value in ends)] for name, ends in found.commands.items()]
     shape = f"response by step of {timestep_s:g} s"

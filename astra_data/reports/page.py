@@ -6,10 +6,10 @@ from itertools import permutations
 
 import numpy as np
 
-from astra_data.core.naming import base_method, is_plus, reference_of
+from astra_data.core.naming import base_method, in_code, is_plus, reference_of
 from astra_data.core.progress import CLOCKS
 from astra_data.methods import grounded_as, method_named, method_role, method_title
-from astra_data.reports.blocks import Block, Code, Section, TableBlock, Text, code, duration, short
+from astra_data.reports.blocks import Block, Code, Section, TableBlock, Text, duration, short
 from astra_data.reports.choice import choice_blocks
 from astra_data.reports.figures.catalog import pictures
 from astra_data.reports.held_out import gap_blocks
@@ -85,12 +85,12 @@ def _facts(results: Results) -> Iterator[Block]:
         yield Text(results.warning, warns=True)
     if results.stand_in:
         yield Text(
-            f"**A simulated stand-in ({code(results.stand_in)}) replaces the physical robot: no number is "
+            f"**A simulated stand-in ({in_code(results.stand_in)}) replaces the physical robot: no number is "
             "from a real robot, and none is comparable to one in absolute terms.**",
             warns=True,
         )
     seeds = ", ".join(map(str, results.seeds))
-    text = f"Task {code(results.task)}, seeds {seeds}, {results.episodes} episodes per method and seed"
+    text = f"Task {in_code(results.task)}, seeds {seeds}, {results.episodes} episodes per method and seed"
     if results.largest != WHOLE:
         text += f"; unless stated otherwise, with {results.largest} % of the data"
     text += "."

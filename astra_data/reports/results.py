@@ -108,13 +108,11 @@ class Results(Facts):
     timestep_s: float | None = None  # of the task
     leg_scale: float = 1.0  # leg length of the target's robot, relative to the one that collected the data
     stand_in: str | None = None  # the simulator that stands in for a physical robot in the target, if any
-    paper_success: dict[str, float] = Field(default_factory=dict)
-    """Method → the success rate that the paper prints for it."""
+    paper_success: dict[str, float] = Field(default_factory=dict)  # method → what the paper prints
     judged: Judgment | None = None  # the choice without the target; None where `select` was not run
     settings: dict[str, JsonValue] = Field(default_factory=dict)  # all settings of the recipe, with defaults filled in
     origins: list[Origin] = Field(default_factory=list)  # normally one; more if code or machine changed between stages
-    user_code: dict[str, str] = Field(default_factory=dict)
-    """Digests of the user's code: "task", and methods by their names."""
+    user_code: dict[str, str] = Field(default_factory=dict)  # digests: "task", and methods by name
     datasets: list[DatasetUse] = Field(default_factory=list)
     lines: list[Line] = Field(default_factory=list)
     errors: list[Errors] = Field(default_factory=list)

@@ -18,8 +18,7 @@ from astra_data.reports import artifacts, results
 from astra_data.reports.choice import Judgment, read_judged
 from astra_data.worlds.objective import SUCCESS, Score
 
-DATASET_STAGES = ("collect", "label", "augment", "pair", "subset")
-"""Stages that write a dataset of each seed, in their order."""
+DATASET_STAGES = ("collect", "label", "augment", "pair", "subset")  # they write a dataset of each seed
 SHARED_WORLDS = ("raw", "grounded")  # simulators in which all methods are tested
 
 

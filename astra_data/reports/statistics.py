@@ -8,6 +8,7 @@ three seeds there is no interval.
 """
 
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -21,6 +22,9 @@ from astra_data.core.errors import BadInputError
 REPLICATES = 2000  # bootstrap resamples per interval
 CONFIDENCE = 0.95  # nominal coverage of an interval
 LEAST_SEEDS = 3  # seeds below which no interval is given
+_PSEUDO_TRIALS = 2  # as if in so many more, the prediction had said nothing: a few may agree with it by chance
+_FEW = 3  # successes, or failures
+_NORMAL = NormalDist().inv_cdf((1 + CONFIDENCE) / 2)
 
 
 @dataclass(frozen=True)
@@ -73,11 +77,6 @@ def summarize(scores: Sequence[float] | Floats, *, limit: float | None = None, t
     if limit is not None:
         low, high = max(low, 0.0), min(high, limit)
     return Estimate(mean, low, high, float(values.std(ddof=1)), count)
-
-
-_PSEUDO_TRIALS = 2  # as if in so many more, the prediction had said nothing: a few may agree with it by chance
-_FEW = 3  # successes, or failures
-_NORMAL = NormalDist().inv_cdf((1 + CONFIDENCE) / 2)
 
 
 def success_rate(success: Sequence[float], predicted: Sequence[float], mean: float, episodes: int) -> Estimate:
@@ -189,15 +188,11 @@ def correlation(first: Sequence[Floats], second: Sequence[Floats], *, ranks: boo
 
 def _coefficients(pairs: Floats, ranks: bool) -> Floats:
     """Return the coefficient of each of `pairs` (M, 2, N), (M,); NaN where one of the two is constant."""
-    from scipy.stats import rankdata
+    from scipy.stats import pearsonr, rankdata
 
-    values = np.asarray(rankdata(pairs, axis=2), dtype=np.float64) if ranks else pairs
-    apart = values - values.mean(axis=2, keepdims=True)
-    products = apart @ apart.transpose(0, 2, 1) * np.true_divide(1, pairs.shape[2] - 1)
-    deviation = np.sqrt(np.diagonal(products, axis1=1, axis2=2))
-    with np.errstate(invalid="ignore"):
-        found: Floats = products[:, 0, 1] / deviation[:, 0] / deviation[:, 1]
-    return np.where(np.ptp(pairs, axis=2).min(axis=1) == 0, math.nan, found.clip(-1, 1))
+    values = rankdata(pairs, axis=2) if ranks else pairs
+    with warnings.catch_warnings(action="ignore"):  # of those that are constant
+        return np.asarray(pearsonr(values[:, 0], values[:, 1], axis=1).statistic)
 
 
 @cache

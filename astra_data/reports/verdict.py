@@ -20,8 +20,7 @@ from astra_data.reports.statistics import LEAST_SEEDS, Estimate, interval, summa
 ENOUGH = 0.5
 """Share of the largest possible score from which a method can be deployed, and has learned its own simulator; also the
 R² of rewards on held-out episodes from which a grounding predicts them well."""
-_TOO_MANY_FAILURES = 1 / 3
-"""Share of the episodes that end in a failure, such as a fall, from which nothing is deployed."""
+_TOO_MANY_FAILURES = 1 / 3  # share of episodes that end in a failure, such as a fall, from which nothing is deployed
 
 
 @dataclass(frozen=True)

@@ -61,8 +61,7 @@ class Simulator(AbstractSimulator, Protocol):
         torch.Size([3, 2])
     """
 
-    abstract_state: Column
-    """The column of abstract states, with names, units, frames and roles."""
+    abstract_state: Column  # of abstract states, with names, units, frames and roles
 
     @staticmethod
     def abstraction(state: Any) -> Any:  # noqa: ANN401 - numpy arrays of either precision

@@ -130,12 +130,6 @@ def wall_geoms(model: mujoco.MjModel) -> tuple[int, int] | None:
     return (walls[0], walls[-1]) if walls else None
 
 
-def views(model: mujoco.MjModel, state: Floats) -> tuple[Floats, Floats]:
-    """Return views of full states (B, N): positions (B, nq) and velocities (B, nv)."""
-    after_time, end = 1 + model.nq, 1 + model.nq + model.nv
-    return state[:, 1:after_time], state[:, after_time:end]
-
-
 def share_out(
     rows: Iterable[int], pool: ThreadPoolExecutor, work: Callable[[int, Iterator[int]], None], threads: int
 ) -> None:
@@ -167,7 +161,7 @@ class BatchedPhysics:
         self._watched = frozenset(range(watched_geoms[0], watched_geoms[1] + 1) if watched_geoms else ())
         self._measure = measure
         self.state: Floats = np.zeros((num_envs, mujoco.mj_stateSize(model, PHYSICS_STATE)))  # warm start included
-        self.qpos, self.qvel = views(model, self.state)
+        self.qpos, self.qvel, _ = np.split(self.state[:, 1:], [model.nq, model.nq + model.nv], axis=1)  # views
         self.touching: Bools = np.zeros(num_envs, dtype=bool)  # a watched geom, at the end of the last step
         self._control: Floats = self.state[:, self.state.shape[1] - model.nu :]
         self._rows = list(self.state)

@@ -142,7 +142,7 @@ def test_ctrl_c_says_how_to_go_on(recipe: Path, monkeypatch: pytest.MonkeyPatch)
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("astra_data.pipeline.run.record_code", interrupted)
+    monkeypatch.setattr("astra_data.pipeline.run.digests_of", interrupted)
     result = CliRunner().invoke(cli.app, ["run", str(recipe), "--root", str(recipe.parent)])
     assert result.exit_code == 130 and "run the same command again" in result.output
 

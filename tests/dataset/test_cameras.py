@@ -1,4 +1,3 @@
-import io
 import re
 import shutil
 from collections.abc import Sequence
@@ -11,8 +10,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from fake_dataset import COLUMNS, fake_episode, writer
-from PIL import Image
+from fake_dataset import COLUMNS, fake_episode, write_images, writer
 
 from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.dataset.cameras import ClipWriter, clip_fault, decoded, pooled
@@ -20,7 +18,6 @@ from astra_data.dataset.columns import Clip
 from astra_data.dataset.doctor.check import check
 from astra_data.dataset.doctor.repair import repair
 from astra_data.dataset.edit import delete, merge, subset
-from astra_data.dataset.format import IMAGE
 from astra_data.dataset.frames import Frames
 from astra_data.dataset.inspection import inspect_dataset
 from astra_data.dataset.reader import Dataset
@@ -55,17 +52,6 @@ def film(path: Path, frames: int, codec: str = "libx264", **options: str) -> Pat
     return path
 
 
-def stills(path: Path, frames: int) -> Path:
-    """Write a column of images, of which every one is another."""
-    rows = []
-    for number in range(frames):
-        stored = io.BytesIO()
-        Image.fromarray(np.full((4, 4, 3), number, np.uint8)).save(stored, "PNG")
-        rows.append({"bytes": stored.getvalue(), "path": f"{number}.png"})
-    pq.write_table(pa.table({TOP: pa.array(rows, IMAGE)}), path)
-    return path
-
-
 @pytest.fixture(scope="module")
 def source(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     """Three episodes with two cameras, a file each; the first frame of what they were made from belongs to none."""
@@ -73,7 +59,8 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     patch.setattr("astra_data.dataset.parquet.FILE_SIZE_LIMIT", 100)
     patch.setattr("astra_data.dataset.format.VIDEO_FILE_SIZE_MB", 0)
     folder, total = tmp_path_factory.mktemp("cameras"), sum(LENGTHS.values()) + 1
-    video, images = film(folder / "video.mp4", total), stills(folder / "images.parquet", total)
+    stills = (np.full((4, 4, 3), number, np.uint8) for number in range(total))
+    video, images = film(folder / "video.mp4", total), write_images(folder / "images.parquet", TOP, stills)
     first = 1
     with writer(folder / "set", cameras=FEATURES) as opened:
         for uid, steps in LENGTHS.items():

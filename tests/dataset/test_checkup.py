@@ -133,7 +133,7 @@ def test_warnings_come_first_and_findings_are_recorded(tmp_path: Path) -> None:
     checkup = check_up(write_logs(tmp_path / "logs", two))
     assert [finding.severity for finding in checkup.findings] == ["warning", "note"]
     record = checkup.record()
-    assert record["dataset"] == "logs@data-1.0.0" and record["findings"][0]["episodes"] == [3, 4]
+    assert record["dataset"] == "logs@data-1.0.0" and record["findings"][0]["episodes"] == (3, 4)
     assert set(record["findings"][1]) == set(Finding.__dataclass_fields__)
 
 

@@ -5,21 +5,11 @@ import pytest
 from fake_dataset import COLUMNS, fake_columns
 
 from astra_data.core.errors import BadInputError
-from astra_data.dataset.columns import (
-    ACTION,
-    REWARD,
-    STATE,
-    Array,
-    Column,
-    Episode,
-    in_blocks,
-    new_uid,
-    renamed_metadata,
-)
+from astra_data.dataset import columns as keys
 
 
 def test_a_column_survives_the_way_through_features() -> None:
-    assert [Column.from_feature(column.name, column.feature()) for column in COLUMNS] == list(COLUMNS)
+    assert [keys.Column.from_feature(column.name, column.feature()) for column in COLUMNS] == list(COLUMNS)
 
 
 def test_a_feature_carries_what_each_index_means() -> None:
@@ -33,7 +23,7 @@ def test_a_feature_carries_what_each_index_means() -> None:
 
 def test_a_column_that_contradicts_itself_is_refused_with_every_fault() -> None:
     with pytest.raises(BadInputError) as caught:
-        Column("a/b", "float16", 2, names=("x",), astra={"unit": ["m"], "role": ["pos", "heading"], "x": []})
+        keys.Column("a/b", "float16", 2, names=("x",), astra={"unit": ["m"], "role": ["pos", "heading"], "x": []})
     message = str(caught.value)
     for part in ("'/'", "float16", "1 names for 2", "1 words in astra's unit", "unknown role pos", "has 'x'"):
         assert part in message
@@ -42,20 +32,20 @@ def test_a_column_that_contradicts_itself_is_refused_with_every_fault() -> None:
 def test_an_episode_makes_its_columns_contiguous_and_its_metadata_plain() -> None:
     batch = np.zeros((5, 8, 3), np.float32)
     metadata: dict[str, Any] = {"success": np.bool_(True), "return": np.float32(0.5)}
-    episode = Episode(0, {STATE: batch[:, 2]}, metadata)
-    assert episode.columns[STATE].flags.c_contiguous and episode.metadata == {"success": True, "return": 0.5}
+    episode = keys.Episode(0, {keys.STATE: batch[:, 2]}, metadata)
+    assert episode.columns[keys.STATE].flags.c_contiguous and episode.metadata == {"success": True, "return": 0.5}
     assert {type(value) for value in episode.metadata.values()} == {bool, float}
 
 
 def test_every_fault_of_an_episode_is_reported_at_once() -> None:
     columns = fake_columns(6, seed=1)
-    columns[STATE][4, 1] = np.nan
-    columns[STATE][5, 0] = np.inf
-    columns[ACTION] = columns[ACTION].astype(np.float64)
-    columns[REWARD] = columns[REWARD][:5, None, None]
+    columns[keys.STATE][4, 1] = np.nan
+    columns[keys.STATE][5, 0] = np.inf
+    columns[keys.ACTION] = columns[keys.ACTION].astype(np.float64)
+    columns[keys.REWARD] = columns[keys.REWARD][:5, None, None]
     columns["episode_uid"] = np.zeros(6, np.int64)
     with pytest.raises(BadInputError) as caught:
-        Episode(-1, columns, {"return": float("nan"), "seeds": [1]})  # type: ignore[dict-item]
+        keys.Episode(-1, columns, {"return": float("nan"), "seeds": [1]})  # type: ignore[dict-item]
     message = str(caught.value)
     assert "\n" not in message
     for part in (
@@ -73,20 +63,24 @@ def test_every_fault_of_an_episode_is_reported_at_once() -> None:
 
 def test_one_value_per_step_may_be_given_as_gymnasium_has_it() -> None:
     rewards = np.arange(3, dtype=np.float32)
-    assert Episode(0, {REWARD: rewards[:, None]}).columns[REWARD].tolist() == [0.0, 1.0, 2.0]
-    assert Episode(0, {STATE: np.zeros((1, 2), np.float32)}).columns[STATE].shape == (1, 2)
+    assert keys.Episode(0, {keys.REWARD: rewards[:, None]}).columns[keys.REWARD].tolist() == [0.0, 1.0, 2.0]
+    assert keys.Episode(0, {keys.STATE: np.zeros((1, 2), np.float32)}).columns[keys.STATE].shape == (1, 2)
     for empty in (np.zeros((3, 0), np.float32), np.zeros((3, 1, 0), np.float32)):
         with pytest.raises(BadInputError, match=r"next.reward: shape .*, expected \(T,\) or \(T, size\)"):
-            Episode(0, {REWARD: empty})
+            keys.Episode(0, {keys.REWARD: empty})
 
 
 @pytest.mark.parametrize(
     ("columns", "part"),
-    [({}, "no columns"), ({STATE: np.zeros((0, 2), np.float32)}, "no steps"), ({STATE: np.float32(1)}, "shape ()")],
+    [
+        ({}, "no columns"),
+        ({keys.STATE: np.zeros((0, 2), np.float32)}, "no steps"),
+        ({keys.STATE: np.float32(1)}, "shape ()"),
+    ],
 )
-def test_an_empty_episode_is_refused(columns: dict[str, Array], part: str) -> None:
+def test_an_empty_episode_is_refused(columns: dict[str, keys.Array], part: str) -> None:
     with pytest.raises(BadInputError) as caught:
-        Episode(0, columns)
+        keys.Episode(0, columns)
     assert part in str(caught.value)
 
 
@@ -100,7 +94,7 @@ def test_an_empty_episode_is_refused(columns: dict[str, Array], part: str) -> No
 )
 def test_roles_must_make_sense(astra: dict[str, list[str]], fault: str) -> None:
     with pytest.raises(BadInputError, match=fault):
-        Column("pose", size=3, names=("a", "b", "c"), astra=astra)
+        keys.Column("pose", size=3, names=("a", "b", "c"), astra=astra)
 
 
 @pytest.mark.parametrize(
@@ -108,34 +102,34 @@ def test_roles_must_make_sense(astra: dict[str, list[str]], fault: str) -> None:
 )
 def test_a_damaged_entry_of_features_is_bad_input(change: dict[str, object]) -> None:
     with pytest.raises(BadInputError, match="Column 'x'"):
-        Column.from_feature("x", {"dtype": "float32", "shape": [1], "names": None} | change)
+        keys.Column.from_feature("x", {"dtype": "float32", "shape": [1], "names": None} | change)
 
 
-def _episodes(*lengths: int) -> list[Episode]:
-    return [Episode(uid, {"action": np.zeros(length, np.float32)}) for uid, length in enumerate(lengths)]
+def _episodes(*lengths: int) -> list[keys.Episode]:
+    return [keys.Episode(uid, {"action": np.zeros(length, np.float32)}) for uid, length in enumerate(lengths)]
 
 
 def test_a_block_ends_with_the_episode_that_fills_it() -> None:
     """None is left out or split, and the last is there though it isn't full."""
-    blocks = in_blocks(_episodes(3, 2, 9, 1, 4, 1), rows=5)
+    blocks = keys.in_blocks(_episodes(3, 2, 9, 1, 4, 1), rows=5)
     assert [[episode.uid for episode in block] for block in blocks] == [[0, 1], [2], [3, 4], [5]]
 
 
 def test_a_uid_that_is_taken_is_replaced_by_one_that_is_free_and_fits_a_column() -> None:
     """It is 64 bits with a sign, and depends on where the episode comes from."""
-    new = new_uid(7, b"origin", {7})
-    assert new != 7 and 0 <= new < 2**63 and new == new_uid(7, b"origin", {7})
-    assert new != new_uid(7, b"another", {7}) and new_uid(7, b"origin", {7, new}) not in {7, new}
+    new = keys.new_uid(7, b"origin", {7})
+    assert new != 7 and 0 <= new < 2**63 and new == keys.new_uid(7, b"origin", {7})
+    assert new != keys.new_uid(7, b"another", {7}) and keys.new_uid(7, b"origin", {7, new}) not in {7, new}
 
 
 def test_metadata_name_the_episodes_by_their_new_uids() -> None:
     """What a copy was made from is renamed with it; the uid that an episode had is kept beside."""
     names = {1: 11, 2: 2}
-    assert renamed_metadata(1, {"angle": 0.5, "source_episode": 1}, names) == {
+    assert keys.renamed_metadata(1, {"angle": 0.5, "source_episode": 1}, names) == {
         "angle": 0.5,
         "source_episode": 11,
         "merged_uid": 1,
     }
-    assert renamed_metadata(2, {"source_episode": 1}, names) == {"source_episode": 11}
-    assert renamed_metadata(2, {"source_episode": 5}, names) == {"source_episode": 5}
-    assert renamed_metadata(2, {}, names) == {}
+    assert keys.renamed_metadata(2, {"source_episode": 1}, names) == {"source_episode": 11}
+    assert keys.renamed_metadata(2, {"source_episode": 5}, names) == {"source_episode": 5}
+    assert keys.renamed_metadata(2, {}, names) == {}

@@ -1,7 +1,4 @@
-"""Whatever a dataset holds: it is read, or one clear message. Nothing hangs, nothing ends in a traceback.
-
-ASTRA_DATA_FUZZ is how many random examples are tried of each kind; by default few, always the same.
-"""
+"""Whatever a dataset holds: it is read, or one clear message. Nothing hangs, nothing ends in a traceback."""
 
 import json
 import os
@@ -18,7 +15,8 @@ import pyarrow.parquet as pq
 import pytest
 from damaged import DATA, EPISODES
 from fake_dataset import write_fake
-from hypothesis import HealthCheck, given, settings
+from fuzzing import Edit, broken, edits, fuzzed, shares
+from hypothesis import given
 from hypothesis import strategies as st
 from nested import places
 
@@ -27,14 +25,6 @@ from astra_data.dataset.doctor.check import check
 from astra_data.dataset.doctor.repair import repair
 from astra_data.dataset.inspection import inspect_dataset
 from astra_data.dataset.reader import Dataset
-
-fuzzed = settings(
-    max_examples=int(os.environ.get("ASTRA_DATA_FUZZ", "10")),
-    deadline=None,
-    derandomize="ASTRA_DATA_FUZZ" not in os.environ,
-    database=None,
-    suppress_health_check=list(HealthCheck),
-)
 
 INFO = "meta/info.json"
 JSON = (INFO, "meta/stats.json", "meta/astra/dataset.json", "meta/astra/subsets.json")
@@ -130,21 +120,11 @@ def test_hostile_values_are_told(kind: str) -> None:
         read(root)
 
 
-edits = st.lists(
-    st.tuples(st.floats(0, 1, exclude_max=True), st.binary(max_size=8), st.booleans()), min_size=1, max_size=4
-)
-"""Where, as a share of the file, bytes are overwritten or, if true, everything from there on is cut off."""
-
-
 @given(name=st.sampled_from([*JSON, *PARQUET]), changes=edits)
-@fuzzed
-def test_broken_files(name: str, changes: list[tuple[float, bytes, bool]]) -> None:
+@fuzzed(10)
+def test_broken_files(name: str, changes: list[Edit]) -> None:
     with copied() as root:
-        content = (root / name).read_bytes()
-        for share, new, is_cut in changes:
-            place = int(share * len(content))
-            content = content[:place] + new + (b"" if is_cut else content[place + len(new) :])
-        (root / name).write_bytes(content)
+        (root / name).write_bytes(broken((root / name).read_bytes(), changes))
         read(root)
 
 
@@ -160,8 +140,8 @@ HOSTILE: st.SearchStrategy[object] = st.one_of(
 )
 
 
-@given(name=st.sampled_from(JSON), share=st.floats(0, 1, exclude_max=True), value=HOSTILE)
-@fuzzed
+@given(name=st.sampled_from(JSON), share=shares, value=HOSTILE)
+@fuzzed(10)
 def test_json_with_a_hostile_value(name: str, share: float, value: object) -> None:
     with copied() as root:
         content = json.loads((root / name).read_text())

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fake_dataset import COLUMNS, DESCRIPTION, fake_episode, write_fake, writer
+from fake_dataset import COLUMNS, DESCRIPTION, assert_same, fake_episode, write_fake, writer
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import STATE, Column
@@ -34,10 +34,7 @@ def assert_taken_over(source: Dataset, root: Path) -> None:
     assert made.verify() == []
     episodes = {episode.uid: episode for episode in source.episodes()}
     assert [uid for uid in source.uids.tolist() if uid in uids(root)] == made.uids.tolist()
-    for episode in made.episodes():
-        assert episode.metadata == episodes[episode.uid].metadata
-        for name, values in episode.columns.items():
-            np.testing.assert_array_equal(values, episodes[episode.uid].columns[name])
+    assert_same(made.episodes(), [episodes[uid] for uid in made.uids.tolist()])
 
 
 def test_subsets_are_nested_and_described(forty: Dataset, tmp_path: Path) -> None:

@@ -17,17 +17,7 @@ from typer.testing import CliRunner
 from astra_data.cli.app import app
 from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.dataset import Dataset
-from astra_data.dataset.columns import (
-    ACTION,
-    DONE,
-    NEXT_STATE,
-    REWARD,
-    STATE,
-    SUCCESS,
-    TERMINATED,
-    TRUNCATED,
-    Array,
-)
+from astra_data.dataset import columns as keys
 from astra_data.dataset.doctor.check import check
 from astra_data.dataset.doctor.repair import repair
 from astra_data.dataset.lerobot_recording import RECORDED_TASK
@@ -68,20 +58,20 @@ def test_next_states_are_those_of_the_following_rows(arm: Dataset) -> None:
     assert arm.uids.tolist() == list(KEPT) and arm.lengths.tolist() == [5, 8, 3]
     for number, episode in zip(KEPT, arm.episodes(), strict=True):
         expected = values("arm", number)
-        np.testing.assert_array_equal(episode.columns[STATE], expected[STATE][:-1])
-        np.testing.assert_array_equal(episode.columns[NEXT_STATE], expected[STATE][1:])
-        for name in (ACTION, REWARD):
+        np.testing.assert_array_equal(episode.columns[keys.STATE], expected[keys.STATE][:-1])
+        np.testing.assert_array_equal(episode.columns[keys.NEXT_STATE], expected[keys.STATE][1:])
+        for name in (keys.ACTION, keys.REWARD):
             np.testing.assert_array_equal(episode.columns[name], expected[name][:-1])
         np.testing.assert_array_equal(episode.columns["force"], expected["force"][:-1].astype(np.float32))
         last = np.arange(len(episode)) == len(episode) - 1
         # The row that is left out is done: the step before takes over its success.
-        np.testing.assert_array_equal(episode.columns[SUCCESS], last & expected[SUCCESS][-1])
-        assert not episode.columns[TERMINATED].any()
-        np.testing.assert_array_equal(episode.columns[TRUNCATED], last)
-        np.testing.assert_array_equal(episode.columns[DONE], last)
+        np.testing.assert_array_equal(episode.columns[keys.SUCCESS], last & expected[keys.SUCCESS][-1])
+        assert not episode.columns[keys.TERMINATED].any()
+        np.testing.assert_array_equal(episode.columns[keys.TRUNCATED], last)
+        np.testing.assert_array_equal(episode.columns[keys.DONE], last)
         assert set(episode.columns[RECORDED_TASK]) == {number % 2}
     assert arm.metadata == {"success": [True, False, True], "task": ["lift", "lift", "turn"]}
-    assert arm.specs([NEXT_STATE])[0].names == tuple(JOINTS) and (arm.task, arm.info["fps"]) == ("lift / turn", 10)
+    assert arm.specs([keys.NEXT_STATE])[0].names == tuple(JOINTS) and (arm.task, arm.info["fps"]) == ("lift / turn", 10)
     assert arm.description["environment"] == {"robot_type": "so101"}
     pictures = arm.pictures("observation.images.top", 1)
     assert pictures.shape == (8, 8, 8, 3) and pictures[:, 0, 0, 0].tolist() == [9 * step for step in range(8)]
@@ -93,7 +83,7 @@ def test_what_is_left_out_is_said_in_one_line(recorded: Path, caplog: pytest.Log
     assert "the last row of each episode, 4 of 20 rows; 1 of them in episodes of a single row" in line
     assert "images" not in line
     assert "\n" not in line and caplog.records[0].levelno == logging.WARNING and "succeeded" not in line
-    reward = sum(float(values("arm", number)[REWARD][-1]) for number in range(4))
+    reward = sum(float(values("arm", number)[keys.REWARD][-1]) for number in range(4))
     assert f"with the last rows a reward of {reward:g} in sum is left out" in line
     assert line.count(" here, recorded as ") == 1 and line.endswith("; force is float32 here, recorded as float64")
 
@@ -105,10 +95,10 @@ def test_steps_that_float32_rounds_are_told(tmp_path: Path, caplog: pytest.LogCa
     for first, told in ((4_429_530.0, True), (0.0, False)):
         table = pq.read_table(root / DATA)
         rows = [[0.1 * row, first + 0.63 * row, 0.0] for row in range(len(table))]
-        at = table.column_names.index(STATE)
-        pq.write_table(table.set_column(at, STATE, pa.array(rows, pa.list_(pa.float64()))), root / DATA)
+        at = table.column_names.index(keys.STATE)
+        pq.write_table(table.set_column(at, keys.STATE, pa.array(rows, pa.list_(pa.float64()))), root / DATA)
         info = json.loads((root / "meta/info.json").read_text())
-        info["features"][STATE]["dtype"] = "float64"
+        info["features"][keys.STATE]["dtype"] = "float64"
         (root / "meta/info.json").write_text(json.dumps(info))
         caplog.clear()
         Dataset.open(root)
@@ -150,7 +140,7 @@ def test_what_cannot_be_is_one_line(recorded: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("column", "changes", "fault"),
     [
-        (ACTION, {3: [float("nan"), 0.0]}, "action is nan in episode 0 frame 3"),
+        (keys.ACTION, {3: [float("nan"), 0.0]}, "action is nan in episode 0 frame 3"),
         ("frame_index", {70: 3}, "frame_index is 3 in episode 1 frame 10, expected 10"),
     ],
 )
@@ -173,7 +163,7 @@ def test_a_dataset_of_ours_without_its_metadata_keeps_uids_and_next_states(tmp_p
     assert bare.uids.tolist() == ours.uids.tolist() and bare.content_hash == ours.content_hash
 
 
-def merged_episodes(recorded: Path) -> list[dict[str, Array]]:
+def merged_episodes(recorded: Path) -> list[dict[str, keys.Array]]:
     return [dict(episode.columns) for name in ("a", "b") for episode in Dataset.open(recorded / name).episodes()]
 
 

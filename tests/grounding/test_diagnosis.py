@@ -10,15 +10,7 @@ from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ACTION, NEXT_STATE, OUTCOME_COLUMNS, STATE, SUCCESS, TERMINATED, Column, Episode
 from astra_data.dataset.writer import DatasetWriter
-from astra_data.grounding.diagnosis import (
-    Diagnosis,
-    Forecast,
-    Missed,
-    _extrapolated,
-    _of_forecast,
-    _of_hidden_state,
-    diagnose,
-)
+from astra_data.grounding import diagnosis
 from astra_data.pipeline.stages.pair import pair
 from astra_data.reports.diagnosis import diagnosis_page
 
@@ -54,7 +46,7 @@ def recorded(
     held: int = 1,
     drift: str = "",
     deaf: bool = False,
-) -> Diagnosis:
+) -> diagnosis.Diagnosis:
     """Return the diagnosis of 12 recordings of 150 steps, in which commands act `dead` steps late and with a lag.
 
     The state is repeated for `held` steps. A current moves x, the same in a recording or drawn in each step.
@@ -87,7 +79,7 @@ def recorded(
             kinds = {column.name: column.dtype for column in columns}
             writer.add(Episode(number, {name: each.astype(kinds[name]) for name, each in values.items()}, {}))
     simulator = f"{folder / 'axes.py'}:Axes"
-    return diagnose(pair(simulator, dataset=folder / "logs", out=folder / "pairs"), simulator)
+    return diagnosis.diagnose(pair(simulator, dataset=folder / "logs", out=folder / "pairs"), simulator)
 
 
 @pytest.mark.parametrize("dead", [(0, 5), (1, 3), (2, 4)])
@@ -165,7 +157,7 @@ def test_a_command_that_the_simulator_ignores_is_named(tmp_path: Path) -> None:
 
 def test_how_far_it_is_is_told(tmp_path: Path) -> None:
     found, notes = recorded(tmp_path, lag_s=0.2), list[tuple[float, str]]()
-    diagnose(tmp_path / "pairs", f"{tmp_path / 'axes.py'}:Axes", lambda *note: notes.append(note))
+    diagnosis.diagnose(tmp_path / "pairs", f"{tmp_path / 'axes.py'}:Axes", lambda *note: notes.append(note))
     lags = len(found.responses[0].weights) - 1
     steps = 12 * (150 - lags)
     expected = [(lag / (lags + 1), f"{steps * (1 + 3 * lag):,} steps of the simulator") for lag in range(lags + 1)]
@@ -193,17 +185,19 @@ def test_a_command_that_never_changes_is_warned_of(tmp_path: Path) -> None:
 def test_a_forecast_says_more_only_where_its_interval_does(
     now: float, expected: float, gain: tuple[float, float, float], advice: str
 ) -> None:
-    found = Forecast((4, 8), np.full((2, 12), now), 15, (expected, expected - 0.1, expected + 0.1), gain)
-    [line] = _of_forecast(found, [Missed("x", "m", 1.0, 1.0, "2.0 times as large where fast as where not")] * 2)
+    found = diagnosis.Forecast((4, 8), np.full((2, 12), now), 15, (expected, expected - 0.1, expected + 0.1), gain)
+    [line] = diagnosis._of_forecast(
+        found, [diagnosis.Missed("x", "m", 1.0, 1.0, "2.0 times as large where fast as where not")] * 2
+    )
     assert line.advice.startswith(advice)
     assert line.what.startswith(
         f"of the simulator's error, histories leave {now:.2f}, with 15 recordings {expected:.2f} ["
     )
-    found = _extrapolated((7, 10, 20), np.tile([[0.9], [0.23], [0.2075]], 3), 30)  # 0.2 + 3 / recordings²
+    found = diagnosis._extrapolated((7, 10, 20), np.tile([[0.9], [0.23], [0.2075]], 3), 30)  # 0.2 + 3 / recordings²
     assert found.expected == pytest.approx([0.2 + 3 / 900] * 3) and found.gain == pytest.approx(
         [1 - found.expected[0] / 0.2075] * 3
     )
-    [line] = _of_forecast(None, [])
+    [line] = diagnosis._of_forecast(None, [])
     assert line.advice == "record 10 or more"
 
 
@@ -218,7 +212,7 @@ def test_the_page_shows_all_of_it(tmp_path: Path) -> None:
 def test_a_dataset_that_is_not_paired_is_refused(tmp_path: Path) -> None:
     recorded(tmp_path)
     with pytest.raises(BadInputError, match=r"no column abstract.state: expected a dataset that was paired"):
-        diagnose(tmp_path / "logs", f"{tmp_path / 'axes.py'}:Axes")
+        diagnosis.diagnose(tmp_path / "logs", f"{tmp_path / 'axes.py'}:Axes")
 
 
 def test_what_explains_more_is_told_only_where_its_interval_does() -> None:
@@ -232,9 +226,9 @@ def test_what_explains_more_is_told_only_where_its_interval_does() -> None:
         of(0.6, 0.2, 0.7),
         0.62,
     )
-    told = [line.advice for line in _of_hidden_state([present, late, sure, of(whole, 0.6, 0.7)], ["current"])]
+    told = [line.advice for line in diagnosis._of_hidden_state([present, late, sure, of(whole, 0.6, 0.7)], ["current"])]
     assert told == ["there is state that neither the abstract state nor commands show: train `astra_plus`"]
-    told = [line.advice for line in _of_hidden_state([present, late, unsure, of(whole, 0.6, 0.7)], [])]
+    told = [line.advice for line in diagnosis._of_hidden_state([present, late, unsure, of(whole, 0.6, 0.7)], [])]
     assert told == ["for the motion nothing hidden shows: `nas`, or a parameter of the simulator, may do"]
-    told = [line.advice for line in _of_hidden_state([present, late, late, of(whole, 0.6, 0.7)], [])]
+    told = [line.advice for line in diagnosis._of_hidden_state([present, late, late, of(whole, 0.6, 0.7)], [])]
     assert told[-1] == "the simulator may gain from more of it in φ"

@@ -1,19 +1,14 @@
-import io
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
-from fake_dataset import fake_episode, writer
-from PIL import Image
+from fake_dataset import fake_episode, write_images, writer
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import Clip
 from astra_data.dataset.edit import subset
-from astra_data.dataset.format import IMAGE
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.timing import trim
 from astra_data.grounding.features import DEFAULT, ENCODER, encoded, features
@@ -52,18 +47,14 @@ def picture(number: int) -> Any:
 @pytest.fixture(scope="module")
 def source(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     """Three episodes whose column "mode" numbers the steps, as the first pixel of their pictures does."""
-    folder, total, first, rows = tmp_path_factory.mktemp("features"), sum(LENGTHS.values()), 0, []
-    for number in range(total):
-        stored = io.BytesIO()
-        Image.fromarray(picture(number)).save(stored, "PNG")
-        rows.append({"bytes": stored.getvalue(), "path": f"{number}.png"})
-    pq.write_table(pa.table({TOP: pa.array(rows, IMAGE)}), folder / "images.parquet")
+    folder, first = tmp_path_factory.mktemp("features"), 0
+    images = write_images(folder / "images.parquet", TOP, map(picture, range(sum(LENGTHS.values()))))
     feature = {"dtype": "image", "shape": [6, 8, 3], "names": ["height", "width", "channels"]}
     with writer(folder / "set", cameras={TOP: feature}) as opened:
         for uid, steps in LENGTHS.items():
             episode = fake_episode(uid, steps)
             columns = {**episode.columns, "mode": np.arange(first, first + steps)}
-            clip = Clip(folder / "images.parquet", TOP, first, 1, steps)
+            clip = Clip(images, TOP, first, 1, steps)
             opened.add(replace(episode, columns=columns, cameras={TOP: clip}))
             first += steps
     return Dataset.open(folder / "set")

@@ -11,18 +11,9 @@ from toy_episodes import no_episodes
 
 from astra_data.core.checkpoint import load_tensors, save_tensors
 from astra_data.core.errors import BadInputError
+from astra_data.grounding import files
 from astra_data.grounding.alignment import TargetEncoder
 from astra_data.grounding.encoder import take_scales
-from astra_data.grounding.files import (
-    KINDS,
-    check_step,
-    fitted,
-    load_grounding,
-    load_history_model,
-    load_target_encoder,
-    save_grounding,
-    save_target_encoder,
-)
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.model import GroundingModel, GroundingShape
 from astra_data.robots.registry import task_named
@@ -36,8 +27,8 @@ def test_a_history_model_comes_back_frozen(tmp_path: Path) -> None:
     model.set_reward_scales(torch.randn(50, 2) - 10.0 * failed[:, None], 1.0 - failed, failed)
     model.reward_shrinkage.fill_(0.4)
     path = tmp_path / "grounding.safetensors"
-    save_grounding(path, HistoryGrounding(model), no_episodes())
-    for loaded in (load_history_model(path), load_history_model(str(path))):
+    files.save_grounding(path, HistoryGrounding(model), no_episodes())
+    for loaded in (files.load_history_model(path), files.load_history_model(str(path))):
         assert (loaded.shape, loaded.training) == (shape, False)
         assert not any(parameter.requires_grad for parameter in loaded.parameters())
         latent, action, state = torch.randn(3, 8), torch.randn(3, 2), torch.randn(3, 4)
@@ -51,15 +42,15 @@ def test_a_history_model_comes_back_frozen(tmp_path: Path) -> None:
 
 def test_a_grounding_of_the_users_own_is_read_once_it_is_known(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "grounding.safetensors"
-    save_grounding(path, Shifted(torch.ones(2)), no_episodes())
+    files.save_grounding(path, Shifted(torch.ones(2)), no_episodes())
     with pytest.raises(BadInputError, match="found kind shifted"):
-        load_grounding(path)
-    monkeypatch.setitem(KINDS, Shifted.kind, Shifted)
-    monkeypatch.setitem(KINDS, Lossy.kind, Shifted)
-    found = load_grounding(path)
+        files.load_grounding(path)
+    monkeypatch.setitem(files.KINDS, Shifted.kind, Shifted)
+    monkeypatch.setitem(files.KINDS, Lossy.kind, Shifted)
+    found = files.load_grounding(path)
     assert isinstance(found, Shifted) and found.shift.tolist() == [1.0, 1.0]
     with pytest.raises(BadInputError, match="expected a history model, got a grounding without latents"):
-        load_history_model(path)
+        files.load_history_model(path)
 
 
 def test_a_target_encoder_comes_back_frozen(tmp_path: Path) -> None:
@@ -68,8 +59,8 @@ def test_a_target_encoder_comes_back_frozen(tmp_path: Path) -> None:
     encoder.set_scales(3 * state, goal)
     encoder.latent_r2.fill_(0.95)
     path = tmp_path / "encoder.safetensors"
-    save_target_encoder(path, encoder)
-    loaded = load_target_encoder(str(path))
+    files.save_target_encoder(path, encoder)
+    loaded = files.load_target_encoder(str(path))
     assert not loaded.training and not any(parameter.requires_grad for parameter in loaded.parameters())
     assert loaded.is_deployed
     inputs = loaded.encoder_input(state, goal, action)
@@ -83,29 +74,29 @@ def test_a_target_encoder_comes_back_frozen(tmp_path: Path) -> None:
 )
 def test_what_is_no_target_encoder_is_refused(missing: str, message: str, tmp_path: Path) -> None:
     path = tmp_path / "encoder.safetensors"
-    save_target_encoder(path, TargetEncoder(29, 2, 3, embedding_size=16, latent_size=8))
+    files.save_target_encoder(path, TargetEncoder(29, 2, 3, embedding_size=16, latent_size=8))
     tensors, metadata = load_tensors(path)
     del metadata[missing]
     save_tensors(path, tensors, metadata)
     with pytest.raises(BadInputError, match=f"expected a target encoder .*{message}"):
-        load_target_encoder(path)
+        files.load_target_encoder(path)
 
 
 def test_what_a_grounding_of_one_s_own_saves_and_asks_for_is_checked(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path, shifted = tmp_path / "grounding.safetensors", Shifted(torch.ones(2))
-    monkeypatch.setitem(KINDS, Shifted.kind, Shifted)
-    monkeypatch.setitem(KINDS, Lossy.kind, Shifted)
+    monkeypatch.setitem(files.KINDS, Shifted.kind, Shifted)
+    monkeypatch.setitem(files.KINDS, Lossy.kind, Shifted)
     monkeypatch.setattr(Shifted, "to_file", lambda self: ({"offset": self.shift.numpy()}, {}))
     with pytest.raises(BadInputError, match=r"^Shifted.to_file: 'offset' is a ndarray, expected a torch"):
-        save_grounding(path, shifted, no_episodes())
+        files.save_grounding(path, shifted, no_episodes())
     assert not path.exists()
     monkeypatch.setattr(Shifted, "to_file", lambda self: ({"offset": self.shift}, {}))
-    save_grounding(path, shifted, no_episodes())
+    files.save_grounding(path, shifted, no_episodes())
     told = r"^Shifted.from_file, given the tensors offset and .*, fails with KeyError: 'shift'"
     with pytest.raises(BadInputError, match=told):
-        load_grounding(path)
+        files.load_grounding(path)
 
 
 SHIFTED = Shifted(torch.tensor([0.01]))
@@ -113,8 +104,8 @@ SHIFTED = Shifted(torch.tensor([0.01]))
 
 @pytest.fixture
 def known(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(KINDS, Shifted.kind, Shifted)
-    monkeypatch.setitem(KINDS, Lossy.kind, Shifted)
+    monkeypatch.setitem(files.KINDS, Shifted.kind, Shifted)
+    monkeypatch.setitem(files.KINDS, Lossy.kind, Shifted)
 
 
 @pytest.mark.parametrize(
@@ -145,7 +136,7 @@ def known(monkeypatch: pytest.MonkeyPatch) -> None:
 )
 def test_what_is_no_such_pair_is_refused(returned: object, told: str, known: None) -> None:
     with pytest.raises(BadInputError, match=f"^{told}"):
-        fitted(returned)
+        files.fitted(returned)
 
 
 def windows_of(count: int) -> Any:
@@ -176,7 +167,7 @@ def test_a_step_that_is_no_states_is_refused(
 ) -> None:
     monkeypatch.setattr(ShiftedSimulator, "step", landed)
     with pytest.raises(BadInputError, match=f"^ShiftedSimulator.step: {told}$"):
-        check_step(task_named(RAIL), SHIFTED, windows_of(4))
+        files.check_step(task_named(RAIL), SHIFTED, windows_of(4))
 
 
 @pytest.mark.parametrize("shift_m", [0.01, 1e-5])
@@ -189,4 +180,4 @@ def test_a_step_that_leaves_its_simulator_uncorrected_is_refused(
         r"go on uncorrected: expected `return self._settle\(before, corrected\)`"
     )
     with pytest.raises(BadInputError, match=told):
-        check_step(task_named(RAIL), Shifted(torch.tensor([shift_m])), windows_of(4))
+        files.check_step(task_named(RAIL), Shifted(torch.tensor([shift_m])), windows_of(4))

@@ -8,23 +8,7 @@ import torch
 from damaged import reseal
 
 from astra_data.core.errors import BadInputError
-from astra_data.dataset.columns import (
-    ABSTRACT_NEXT_STATE,
-    ABSTRACT_SIMULATED_NEXT_STATE,
-    ABSTRACT_STATE,
-    ACTION,
-    DONE,
-    GOAL,
-    NEXT_STATE,
-    OUTCOME_COLUMNS,
-    REWARD,
-    STATE,
-    SUCCESS,
-    TERMINATED,
-    TRUNCATED,
-    Column,
-    Episode,
-)
+from astra_data.dataset import columns as keys
 from astra_data.dataset.edit import delete
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.writer import DatasetWriter
@@ -33,7 +17,7 @@ from astra_data.robots.registry import TASKS
 from astra_data.worlds.commands import Commands
 
 LENGTHS = (7, 1, 12, 30, 5)
-ABSTRACT = (ABSTRACT_STATE, ABSTRACT_NEXT_STATE, ABSTRACT_SIMULATED_NEXT_STATE)
+ABSTRACT = (keys.ABSTRACT_STATE, keys.ABSTRACT_NEXT_STATE, keys.ABSTRACT_SIMULATED_NEXT_STATE)
 
 
 def label(episode: int, step: int) -> float:
@@ -41,7 +25,7 @@ def label(episode: int, step: int) -> float:
     return 100.0 * (episode + 1) + step
 
 
-SIZES = {STATE: 3, GOAL: 2, ACTION: 2} | dict.fromkeys(ABSTRACT, 4)
+SIZES = {keys.STATE: 3, keys.GOAL: 2, keys.ACTION: 2} | dict.fromkeys(ABSTRACT, 4)
 
 
 def write(
@@ -54,8 +38,8 @@ def write(
     commands: dict[str, tuple[float, float]] | None = None,
     lacks: str = "",
 ) -> Path:
-    outcomes = [column for column in OUTCOME_COLUMNS if column.name != lacks]
-    columns = [*(Column(name, size=size) for name, size in sizes.items()), *outcomes]
+    outcomes = [column for column in keys.OUTCOME_COLUMNS if column.name != lacks]
+    columns = [*(keys.Column(name, size=size) for name, size in sizes.items()), *outcomes]
     description = {"name": "toy", "stage": "pair", "config": {}, "seeds": {"collect": 0}}
     simulator = {"id": "toy"} | ({"commands": commands} if commands else {})
     description |= {"environment": {"id": "toy"}, "simulator": simulator, "parents": []}
@@ -66,21 +50,21 @@ def write(
             values = {name: steps[:, None] + np.arange(size, dtype=np.float32) for name, size in sizes.items()}
             # The third episode succeeds, the fourth topples, the others run out of time.
             ended = last & (episode in (2, 3))
-            values |= {REWARD: -steps, TERMINATED: ended, TRUNCATED: last & ~ended, DONE: last}
-            if NEXT_STATE in sizes:
-                values[NEXT_STATE] = values[STATE] + (~ended if made_up else np.ones(length))[:, None].astype(
+            values |= {keys.REWARD: -steps, keys.TERMINATED: ended, keys.TRUNCATED: last & ~ended, keys.DONE: last}
+            if keys.NEXT_STATE in sizes:
+                values[keys.NEXT_STATE] = values[keys.STATE] + (~ended if made_up else np.ones(length))[:, None].astype(
                     np.float32
                 )
             metadata: dict[str, int] = {} if held_out is None else {"held_out": episode in held_out}
             metadata |= {"source_episode": sources[episode]} if sources and episode in sources else {}
-            values |= {SUCCESS: last & (episode == 2)}
+            values |= {keys.SUCCESS: last & (episode == 2)}
             values.pop(lacks, None)
-            writer.add(Episode(episode, values, metadata))
+            writer.add(keys.Episode(episode, values, metadata))
     return folder
 
 
 def test_a_next_state_that_was_made_up_is_no_step(tmp_path: Path) -> None:
-    sizes = SIZES | {NEXT_STATE: 3}
+    sizes = SIZES | {keys.NEXT_STATE: 3}
     episodes = PairedEpisodes.load(write(tmp_path / "pairs", sizes))
     merged = PairedEpisodes.load(write(tmp_path / "made_up", sizes, held_out=(1, 3), made_up=True))
     # The third and the fourth episode, which are terminated, lose their last step; the one of a step is kept.
@@ -98,7 +82,7 @@ def test_where_no_step_is_one_of_the_robot_there_is_nothing_to_load(
 ) -> None:
     """The third and the fourth episode end in the only step that they have."""
     monkeypatch.setitem(globals(), "LENGTHS", (1, 1, 1, 1))
-    whole = write(tmp_path / "pairs", SIZES | {NEXT_STATE: 3}, made_up=True)
+    whole = write(tmp_path / "pairs", SIZES | {keys.NEXT_STATE: 3}, made_up=True)
     assert PairedEpisodes.load(whole).lengths.tolist() == [1, 1]
     ended = delete(Dataset.open(whole), [0, 1], out=tmp_path / "ended")
     with pytest.raises(BadInputError, match="no step is left: each episode has a single one, whose"):
@@ -205,31 +189,33 @@ def test_windows_hold_every_step_equally_often(episodes: PairedEpisodes, length:
 def test_what_tells_the_place_is_dropped_if_phi_drops_it(
     tmp_path: Path, kept: str | None, dropped: tuple[int, ...]
 ) -> None:
-    root = write(tmp_path / "dataset", SIZES | {STATE: 4})
+    root = write(tmp_path / "dataset", SIZES | {keys.STATE: 4})
     info = json.loads((root / "meta/info.json").read_text())
-    info["features"][STATE]["astra"] = {"role": ["invariant", "position", "position", "heading"]}
+    info["features"][keys.STATE]["astra"] = {"role": ["invariant", "position", "position", "heading"]}
     if kept:
-        info["features"][ABSTRACT_STATE]["astra"] = {"role": [kept] * 4}
+        info["features"][keys.ABSTRACT_STATE]["astra"] = {"role": [kept] * 4}
     (root / "meta/info.json").write_text(json.dumps(info))
     reseal(root)
     assert PairedEpisodes.load(root).dropped_place == dropped
 
 
 def test_pairs_of_another_task_are_told_with_every_mismatch(tmp_path: Path) -> None:
-    sizes = {STATE: 29, GOAL: 2, ACTION: 2} | dict.fromkeys(ABSTRACT, 4)
+    sizes = {keys.STATE: 29, keys.GOAL: 2, keys.ACTION: 2} | dict.fromkeys(ABSTRACT, 4)
     ant = TASKS["antmaze-umaze"]
     PairedEpisodes.load(write(tmp_path / "ant", sizes)).check(ant)
-    other = PairedEpisodes.load(write(tmp_path / "toy", {STATE: 3, GOAL: 5, ACTION: 2} | dict.fromkeys(ABSTRACT, 4)))
+    other = PairedEpisodes.load(
+        write(tmp_path / "toy", {keys.STATE: 3, keys.GOAL: 5, keys.ACTION: 2} | dict.fromkeys(ABSTRACT, 4))
+    )
     with pytest.raises(BadInputError) as caught:
         other.check(ant)
     assert str(caught.value) == (
         "toy@data-1.0.0 has 3 values in a state, antmaze-umaze 29; has 5 values in a goal, antmaze-umaze 2: "
         "pair it again, with the simulator of this task"
     )
-    PairedEpisodes.load(write(tmp_path / "none", {name: size for name, size in sizes.items() if name != GOAL})).check(
-        ant
-    )  # a simulator is corrected without goals
-    wide = write(tmp_path / "wide", {STATE: 29, GOAL: 2, ACTION: 3} | dict.fromkeys(ABSTRACT, 3))
+    PairedEpisodes.load(
+        write(tmp_path / "none", {name: size for name, size in sizes.items() if name != keys.GOAL})
+    ).check(ant)  # a simulator is corrected without goals
+    wide = write(tmp_path / "wide", {keys.STATE: 29, keys.GOAL: 2, keys.ACTION: 3} | dict.fromkeys(ABSTRACT, 3))
     with pytest.raises(BadInputError, match=r"3 values in an abstract state, .* 4; has 3 values in an action"):
         PairedEpisodes.load(wide).check(ant)
     bounded = {"vx": (-1.0, 2.0), "vy": (-1.0, 1.0)}

@@ -1,9 +1,5 @@
-"""Whatever a file or a mapping holds: a dataset that verifies, or one clear message and nothing written.
+"""Whatever a file or a mapping holds: a dataset that verifies, or one clear message and nothing written."""
 
-ASTRA_DATA_FUZZ is how many random examples are tried of each kind; by default few, always the same.
-"""
-
-import os
 import shutil
 import tarfile
 import tempfile
@@ -14,7 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, example, given, settings
+from fuzzing import Edit, broken, edits, fuzzed
+from hypothesis import example, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from mcap_recordings import MAPPING as MCAP_MAPPING
@@ -26,14 +23,6 @@ from astra_data.core.errors import AstraDataError
 from astra_data.dataset.reader import Dataset
 from astra_data.io.importing import import_dataset
 
-fuzzed = settings(
-    max_examples=int(os.environ.get("ASTRA_DATA_FUZZ", "8")),
-    deadline=None,
-    derandomize="ASTRA_DATA_FUZZ" not in os.environ,
-    database=None,
-    suppress_health_check=list(HealthCheck),
-)
-
 MINARI_MAPPING = """
 name = "log"
 task = "walk"
@@ -43,7 +32,6 @@ fields = ["observations/achieved_goal"]
 [columns.action]
 fields = ["actions"]
 """
-Edit = tuple[float, bytes, bool]
 
 
 def check(recording: Path, mapping: str) -> None:
@@ -86,21 +74,9 @@ def sound(name: str) -> bytes:
         return path.read_bytes()
 
 
-shares = st.floats(0, 1, exclude_max=True)
-edits = st.lists(st.tuples(shares, st.binary(max_size=8), st.booleans()), min_size=1, max_size=6)
-"""Where, as a share of the file, bytes are overwritten or, if true, everything from there on is cut off."""
-
-
-def broken(content: bytes, changes: list[Edit]) -> bytes:
-    for share, new, is_cut in changes:
-        place = int(share * len(content))
-        content = content[:place] + new + (b"" if is_cut else content[place + len(new) :])
-    return content
-
-
 @pytest.mark.parametrize("name", FILES)
 @given(changes=edits)
-@fuzzed
+@fuzzed(8)
 def test_broken_files(name: str, changes: list[Edit]) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / name
@@ -110,7 +86,7 @@ def test_broken_files(name: str, changes: list[Edit]) -> None:
 
 @given(name=st.sampled_from(sorted(FILES)), content=st.binary(max_size=300))
 @example(name="log.csv", content=b"")
-@fuzzed
+@fuzzed(8)
 def test_random_bytes(name: str, content: bytes) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / name
@@ -124,7 +100,7 @@ def minari_dataset() -> Path:
 
 
 @given(name=st.sampled_from(["metadata.json", "main_data.hdf5"]), changes=edits)
-@fuzzed
+@fuzzed(8)
 def test_broken_minari_datasets(name: str, changes: list[Edit]) -> None:
     with tempfile.TemporaryDirectory() as folder:
         root = Path(shutil.copytree(minari_dataset(), Path(folder) / "log"))
@@ -141,7 +117,7 @@ arrays = npst.arrays(
 
 @pytest.mark.parametrize("name", ["log.npz", "log.h5"])
 @given(fields=st.dictionaries(st.sampled_from(list(rows())), arrays))
-@fuzzed
+@fuzzed(8)
 def test_arrays_of_any_type_and_shape(name: str, fields: dict[str, Any]) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / name

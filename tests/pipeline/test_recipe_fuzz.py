@@ -1,7 +1,6 @@
-"""Whatever a recipe holds: a model, or one clear message. ASTRA_DATA_FUZZ is how many examples are tried."""
+"""Whatever a recipe holds: a model, or one clear message."""
 
 import json
-import os
 import shutil
 import tempfile
 from contextlib import suppress
@@ -10,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from fuzzing import fuzzed
+from hypothesis import given
 from hypothesis import strategies as st
 from nested import places
 
@@ -19,12 +19,6 @@ from astra_data.core.errors import RecipeError
 from astra_data.pipeline.experiment import load_experiment
 from astra_data.pipeline.recipe import Recipe
 
-fuzzed = settings(
-    max_examples=int(os.environ.get("ASTRA_DATA_FUZZ", "40")),
-    deadline=None,
-    derandomize="ASTRA_DATA_FUZZ" not in os.environ,
-    database=None,
-)
 RECIPES = sorted((Path(__file__).parents[2] / "recipes").glob("*.toml"))
 VALUES = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
@@ -44,14 +38,14 @@ def load(content: bytes) -> None:
             assert str(error).startswith(str(path))
 
 
-@fuzzed
+@fuzzed(40)
 @given(st.binary(max_size=200))
 def test_bytes_that_are_no_recipe(content: bytes) -> None:
     load(content)
 
 
 @pytest.mark.parametrize("path", RECIPES[::8], ids=lambda path: path.stem)
-@fuzzed
+@fuzzed(40)
 @given(place=st.floats(0, 1), text=st.binary(max_size=8), length=st.integers(0, 20))
 def test_a_recipe_with_a_damaged_place(path: Path, place: float, text: bytes, length: int) -> None:
     whole = path.read_bytes()
@@ -79,7 +73,7 @@ def settings_of(path: Path) -> str:
     return json.dumps(without_none(load_experiment(path, path.parent).recipe.settings))
 
 
-@fuzzed
+@fuzzed(40)
 @given(path=st.sampled_from(RECIPES[:4]), share=st.floats(0, 1, exclude_max=True), value=HOSTILE)
 def test_a_hostile_value_at_any_key(path: Path, share: float, value: object) -> None:
     tables = json.loads(settings_of(path))

@@ -102,7 +102,7 @@ def test_a_folder_in_use_is_left_alone(
         with pytest.raises(BadInputError, match="is in use by another run: wait until it ends, or stop it"):
             run_stage(recipe, "collect", root=tmp_path)
 
-    monkeypatch.setattr("astra_data.pipeline.run.record_code", run_again)
+    monkeypatch.setattr("astra_data.pipeline.run.digests_of", run_again)
     run(recipe, root=tmp_path, until="collect")
     assert stages.made == ["collect/seed_0"]
 

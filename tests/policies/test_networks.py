@@ -4,29 +4,18 @@ import pytest
 import torch
 from torch import Tensor
 
-from astra_data.policies.networks import (
-    ActorCritic,
-    ActorCriticShape,
-    AdaptiveShape,
-    Policy,
-    PolicyShape,
-    SoftActor,
-    Student,
-    Teacher,
-    bounded,
-    features_of,
-)
+from astra_data.policies import networks
 
 OBSERVATION, ACTION = torch.randn(3, 5, 4), torch.randn(3, 5, 2)
 
 
-def policies(memory_size: int) -> list[Policy]:
+def policies(memory_size: int) -> list[networks.Policy]:
     torch.manual_seed(0)
     sizes = {"observation_size": 4, "action_size": 2, "memory_size": memory_size, "embedding_size": 7}
-    return [ActorCritic(ActorCriticShape(**sizes)), SoftActor(PolicyShape(**sizes))]  # type: ignore[arg-type]
+    return [networks.ActorCritic(networks.ActorCriticShape(**sizes)), networks.SoftActor(networks.PolicyShape(**sizes))]  # type: ignore[arg-type]
 
 
-def steps(policy: Policy, hidden: Tensor) -> Tensor:
+def steps(policy: networks.Policy, hidden: Tensor) -> Tensor:
     features = []
     for step in range(5):
         seen, hidden = policy.remember(OBSERVATION[:, step], ACTION[:, step], hidden)
@@ -48,19 +37,19 @@ def test_a_start_empties_the_memory_of_its_row() -> None:
     start = torch.zeros(3, 5)
     start[1, 2] = 1.0
     known, other = torch.randn(2, 3, 6)
-    ours, theirs = (features_of(memory, OBSERVATION, ACTION, hidden, start) for hidden in (known, other))
+    ours, theirs = (networks.features_of(memory, OBSERVATION, ACTION, hidden, start) for hidden in (known, other))
     torch.testing.assert_close(ours[1, 2:], theirs[1, 2:])
     assert not torch.allclose(ours[1, :2], theirs[1, :2]) and not torch.allclose(ours[0], theirs[0])
-    assert torch.equal(features_of(None, OBSERVATION, ACTION, known, start), OBSERVATION)
+    assert torch.equal(networks.features_of(None, OBSERVATION, ACTION, known, start), OBSERVATION)
 
 
 def test_means_are_clipped_and_keep_the_gradient_of_what_is_not() -> None:
     output = torch.tensor([-7.0, -0.4, 0.9, 3.0], requires_grad=True)
-    mean = bounded(output)
+    mean = networks.bounded(output)
     torch.testing.assert_close(mean, torch.tensor([-1.0, -0.4, 0.9, 1.0]))
     mean.sum().backward()
     assert output.grad is not None and torch.equal(output.grad, torch.ones(4))
-    policy, seen = ActorCritic(ActorCriticShape(3, 2, initial_log_std=-1.0)), 1e3 * torch.randn(50, 3)
+    policy, seen = networks.ActorCritic(networks.ActorCriticShape(3, 2, initial_log_std=-1.0)), 1e3 * torch.randn(50, 3)
     clipped, std = policy.policy(seen)
     torch.testing.assert_close(clipped, policy.actor(seen).clamp(-1.0, 1.0))
     torch.testing.assert_close(std, torch.full((50, 2), -1.0).exp())
@@ -98,26 +87,29 @@ def test_the_density_of_an_action_is_that_of_its_distribution() -> None:
         torch.testing.assert_close(policy.log_prob(OBSERVATION, action), expected, atol=1e-4, rtol=1e-4)
         for bound in (1.0, -1.0):
             assert policy.log_prob(OBSERVATION, torch.full((3, 5, 2), bound)).isfinite().all()
-        if isinstance(policy, SoftActor):
+        if isinstance(policy, networks.SoftActor):
             drawn, density = policy.sample(OBSERVATION)
             torch.testing.assert_close(density, policy.log_prob(OBSERVATION, drawn), atol=1e-3, rtol=1e-3)
             for parameter in [*policy.actor.parameters()][-2:]:
                 parameter.requires_grad_(False).zero_()
             torch.testing.assert_close(policy.policy(OBSERVATION)[1], torch.full((3, 5, 2), 1.001))
-        elif isinstance(policy, ActorCritic):
+        elif isinstance(policy, networks.ActorCritic):
             weights = ([*network.parameters()][-2].detach() for network in (policy.actor, policy.critic))
             sizes = [float(weight.norm(dim=1).max()) for weight in weights]
             assert sizes == pytest.approx([0.01, 1.0], rel=1e-3)
 
 
-SHAPE = AdaptiveShape(3, 2, memory_size=8, hidden_sizes=(16,), extrinsics_size=4, history_length=45)
+SHAPE = networks.AdaptiveShape(3, 2, memory_size=8, hidden_sizes=(16,), extrinsics_size=4, history_length=45)
 
 
 @torch.no_grad()
 def test_features_are_those_of_an_actor_critic_and_the_extrinsics() -> None:
     torch.manual_seed(0)
-    teacher, observed = Teacher(SHAPE, parameter_count=6), torch.randn(5, 9, 3 + 6)
-    student, plain = Student.of_teacher(teacher), ActorCritic(ActorCriticShape(3, 2, memory_size=8))
+    teacher, observed = networks.Teacher(SHAPE, parameter_count=6), torch.randn(5, 9, 3 + 6)
+    student, plain = (
+        networks.Student.of_teacher(teacher),
+        networks.ActorCritic(networks.ActorCriticShape(3, 2, memory_size=8)),
+    )
     assert plain.memory is not None and teacher.memory is not None
     plain.memory.load_state_dict(teacher.memory.state_dict())
     action, start = torch.randn(5, 9, 2), torch.zeros(5, 9)
@@ -138,7 +130,7 @@ def test_features_are_those_of_an_actor_critic_and_the_extrinsics() -> None:
 @torch.no_grad()
 def test_a_teachers_extrinsics_depend_on_the_parameters_alone() -> None:
     torch.manual_seed(0)
-    teacher, observed = Teacher(SHAPE, parameter_count=6), torch.randn(5, 9)
+    teacher, observed = networks.Teacher(SHAPE, parameter_count=6), torch.randn(5, 9)
     elsewhere = torch.cat([torch.randn(5, 3), observed[:, 3:]], dim=1)
     assert torch.equal(teacher.extrinsics(elsewhere), teacher.extrinsics(observed))
     assert (teacher.extrinsics(observed[:, [0, 1, 2, 8, 7, 6, 5, 4, 3]]) - teacher.extrinsics(observed)).any()
@@ -147,9 +139,9 @@ def test_a_teachers_extrinsics_depend_on_the_parameters_alone() -> None:
 @torch.no_grad()
 def test_a_student_acts_like_its_teacher_where_it_estimates_well_and_holds_nothing_of_the_encoder() -> None:
     torch.manual_seed(0)
-    teacher = Teacher(SHAPE, parameter_count=6)
+    teacher = networks.Teacher(SHAPE, parameter_count=6)
     teacher.log_std.fill_(-1.5)
-    student = Student.of_teacher(teacher)
+    student = networks.Student.of_teacher(teacher)
     features = torch.randn(5, 3 + 8 + 4)
     for one, other in zip(student.policy(features), teacher.policy(features), strict=True):
         assert torch.equal(one, other)
@@ -162,7 +154,7 @@ def test_a_student_acts_like_its_teacher_where_it_estimates_well_and_holds_nothi
 @torch.no_grad()
 def test_a_student_remembers_a_sequence_as_it_does_step_by_step() -> None:
     torch.manual_seed(0)
-    student = Student(SHAPE)
+    student = networks.Student(SHAPE)
     observation, action = torch.randn(3, 6, 3), torch.randn(3, 6, 2)
     start = torch.zeros(3, 6)
     start[1, 4] = 1.0

@@ -10,17 +10,7 @@ from astra_data.grounding.history import GroundedSimulator, HistoryGrounding
 from astra_data.grounding.model import GroundingModel, GroundingShape
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.simulator import NO_GROUNDING, EpisodeSimulator, Grounding
-from astra_data.policies.simulator_env import (
-    DataStarts,
-    Simulation,
-    SimulatorEnv,
-    WorldConfig,
-    command_limit,
-    data_starts,
-    plus,
-    policy_observation,
-    training_env,
-)
+from astra_data.policies import simulator_env
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.objective import NO_LIMIT
 from astra_data.worlds.plane.mazes import U_MAZE
@@ -29,12 +19,12 @@ from astra_data.worlds.plane.point_mass import PointMass, VariedPlanar
 from astra_data.worlds.variation import PlanarVariation
 
 NAVIGATION = Navigation(U_MAZE, horizon=700)
-PREDICTED = WorldConfig(reward="predicted")
+PREDICTED = simulator_env.WorldConfig(reward="predicted")
 
 
-def world(num_envs: int = 4, **options: Any) -> SimulatorEnv:
+def world(num_envs: int = 4, **options: Any) -> simulator_env.SimulatorEnv:
     simulator = EpisodeSimulator(PointMass(U_MAZE, num_envs, timestep_s=0.05))
-    return SimulatorEnv(NAVIGATION, simulator, WorldConfig(**options))
+    return simulator_env.SimulatorEnv(NAVIGATION, simulator, simulator_env.WorldConfig(**options))
 
 
 class Risky(GroundedSimulator):
@@ -46,13 +36,13 @@ class Risky(GroundedSimulator):
         return torch.full((len(self.state),), self.risk)
 
 
-def risky(count: int, risk: float, reward: Any = "abstract", **options: Any) -> SimulatorEnv:
+def risky(count: int, risk: float, reward: Any = "abstract", **options: Any) -> simulator_env.SimulatorEnv:
     """Return episodes of which every second one reaches the goal in the first step."""
     torch.manual_seed(0)
     model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8)).requires_grad_(False)
     simulator = Risky(PointMass(U_MAZE, count, timestep_s=0.05), HistoryGrounding(model))
     simulator.risk = risk
-    one = SimulatorEnv(NAVIGATION, simulator, WorldConfig(reward=reward), **options)
+    one = simulator_env.SimulatorEnv(NAVIGATION, simulator, simulator_env.WorldConfig(reward=reward), **options)
     state = torch.tensor([[-4.0, 4.0, 0.0, 0.0], [-3.54, -4.0, 0.0, 0.0]]).repeat(count // 2, 1)
     goal = torch.tensor([[-4.0, -4.0]]).expand(count, 2)
     one.load_state_dict({"state": state, "goal": goal, "hidden": torch.zeros(count, 8)})
@@ -64,9 +54,9 @@ BACK = torch.tensor([[-1.0, 0.0]])
 
 def test_observations_are_scaled_positions_velocity_and_the_way_to_the_goal() -> None:
     state, goal = torch.tensor([[5.0, -10.0, 0.5, -0.5]]), torch.tensor([[-4.0, 4.0]])
-    seen = policy_observation(NAVIGATION, state, goal, None)
+    seen = simulator_env.policy_observation(NAVIGATION, state, goal, None)
     assert seen[0].tolist() == pytest.approx([0.5, -1.0, 0.5, -0.5, -0.4, 0.4, -0.9, 1.4])
-    with_latent = policy_observation(NAVIGATION, state, goal, torch.tensor([[7.0, 1.0, -5.0, 5.0]]))
+    with_latent = simulator_env.policy_observation(NAVIGATION, state, goal, torch.tensor([[7.0, 1.0, -5.0, 5.0]]))
     assert with_latent.tolist() == [[3.5, 0.5, -2.5, 2.5, *seen[0].tolist()]]
 
 
@@ -119,7 +109,7 @@ def test_a_predicted_reward_is_the_tasks_own_corrected_and_what_the_risk_costs()
     model.failure_cost.fill_(-8.0)
     failures = FailureModel(FailureShape(4, 2, 0.05, members=1, risk_steps=2)).eval()
     grounded = HistoryGrounding(model, failures).corrected(PointMass(U_MAZE, 3, timestep_s=0.05))
-    one = SimulatorEnv(NAVIGATION, grounded, PREDICTED)
+    one = simulator_env.SimulatorEnv(NAVIGATION, grounded, PREDICTED)
     one.reset()
     before, latent, action = one.simulator.state, grounded.latent, torch.full((3, 2), 0.2)
     step = one.step(action)
@@ -134,7 +124,7 @@ def test_predicted_rewards_leave_to_the_task_what_the_simulated_state_shows() ->
     torch.manual_seed(0)
     task = TASKS["nao-kick"]
     model = GroundingModel(GroundingShape(8, 3, 2, latent_size=8, ball_index=4, corrects_reward=False))
-    one = SimulatorEnv(task.objective, HistoryGrounding(model).corrected(task.simulator(3)), PREDICTED)
+    one = simulator_env.SimulatorEnv(task.objective, HistoryGrounding(model).corrected(task.simulator(3)), PREDICTED)
     # Balls that roll on in the field, into the goal, and over the side line.
     balls = torch.tensor([[0.0, 0.0, 0.5, 0.0], [1.4, 0.0, 1.0, 0.0], [0.0, 1.9, 0.0, 1.0]])
     state = torch.cat([torch.tensor([[-1.0, 0.0, 0.0, 0.0]]).expand(3, 4), balls], dim=-1)
@@ -172,8 +162,8 @@ def test_a_change_of_the_command_costs_its_square_whatever_the_penalty_scale() -
 def test_parameters_of_the_episode_are_observed_where_asked_for() -> None:
     variation = PlanarVariation(friction=(0.8, 1.2), heading_bias_deg=(-5.0, 5.0))
     simulator = VariedPlanar(PointMass(U_MAZE, 4, timestep_s=0.05), variation)
-    assert SimulatorEnv(NAVIGATION, EpisodeSimulator(simulator)).observation_size == 8
-    showing = SimulatorEnv(NAVIGATION, EpisodeSimulator(simulator), shows_parameters=True)
+    assert simulator_env.SimulatorEnv(NAVIGATION, EpisodeSimulator(simulator)).observation_size == 8
+    showing = simulator_env.SimulatorEnv(NAVIGATION, EpisodeSimulator(simulator), shows_parameters=True)
     assert (showing.observation_size, showing.parameter_count) == (8 + 7, 7)
     before = showing.reset()
     torch.testing.assert_close(before[:, 8], (simulator.parameters[:, 0] - 1.0) / 0.2)
@@ -189,9 +179,11 @@ def test_recorded_starts_hand_over_their_history() -> None:
     torch.manual_seed(0)
     model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8)).requires_grad_(False)
     state, goal = torch.tensor([[4.0, 0.0, 0.1, -0.9]]), torch.tensor([[-4.2, -4.1]])
-    starts = DataStarts(state, goal, torch.tensor([[0.5, -1.0]]), hidden=torch.randn(1, 8))
+    starts = simulator_env.DataStarts(state, goal, torch.tensor([[0.5, -1.0]]), hidden=torch.randn(1, 8))
     grounded = HistoryGrounding(model).corrected(PointMass(U_MAZE, 3, timestep_s=0.05))
-    one = SimulatorEnv(NAVIGATION, grounded, WorldConfig(data_start_share=1.0), starts=starts)
+    one = simulator_env.SimulatorEnv(
+        NAVIGATION, grounded, simulator_env.WorldConfig(data_start_share=1.0), starts=starts
+    )
     one.reset()
     assert starts.hidden is not None
     expected = model.encoder.step(model.encoder_input(state, goal, starts.previous_action), starts.hidden)
@@ -200,7 +192,7 @@ def test_recorded_starts_hand_over_their_history() -> None:
 
 
 TASK = TASKS["antmaze-umaze"]
-FROM_DATA = WorldConfig(data_start_share=1.0)
+FROM_DATA = simulator_env.WorldConfig(data_start_share=1.0)
 
 
 @pytest.fixture
@@ -222,29 +214,29 @@ def grounding() -> HistoryGrounding:
     return HistoryGrounding(GroundingModel(GroundingShape(4, 2, 2, latent_size=8)))
 
 
-def built(world: WorldConfig, grounding: Grounding, **given: Any) -> SimulatorEnv:
+def built(world: simulator_env.WorldConfig, grounding: Grounding, **given: Any) -> simulator_env.SimulatorEnv:
     options: dict[str, Any] = {"num_envs": 4, "device": "cpu"} | given
-    return training_env(TASK, Simulation(world), grounding, **options)
+    return simulator_env.training_env(TASK, simulator_env.Simulation(world), grounding, **options)
 
 
 def test_without_settings_it_is_the_plain_simulator(episodes: PairedEpisodes, grounding: HistoryGrounding) -> None:
     kinds: dict[type[EpisodeSimulator], Grounding] = {EpisodeSimulator: NO_GROUNDING, GroundedSimulator: grounding}
     for kind, used in kinds.items():
-        assert data_starts(TASK, WorldConfig(), episodes, used) is None
-        world = built(WorldConfig(), used)
+        assert simulator_env.data_starts(TASK, simulator_env.WorldConfig(), episodes, used) is None
+        world = built(simulator_env.WorldConfig(), used)
         assert type(world.simulator) is kind and type(world.simulator.simulator) is PointMass
-        assert (world.world, world.num_envs) == (WorldConfig(), 4)
+        assert (world.world, world.num_envs) == (simulator_env.WorldConfig(), 4)
         drawn = torch.get_rng_state()
         world.step(torch.zeros(4, 2))
         assert torch.equal(torch.get_rng_state(), drawn)
 
 
 def test_plus_settings_reach_the_environment_and_leave_the_rest(episodes: PairedEpisodes) -> None:
-    plain = WorldConfig(reward="predicted", data_start_share=0.3)
-    settings = plus(plain, 0.75)
+    plain = simulator_env.WorldConfig(reward="predicted", data_start_share=0.3)
+    settings = simulator_env.plus(plain, 0.75)
     changes = {"reward": "priced", "change_penalty": 0.02, "command_limit": 0.75}
     assert settings.model_dump() == plain.model_dump() | changes
-    starts = data_starts(TASK, settings, episodes, NO_GROUNDING)
+    starts = simulator_env.data_starts(TASK, settings, episodes, NO_GROUNDING)
     world = built(settings, NO_GROUNDING, starts=starts)
     assert world.world == settings
 
@@ -255,8 +247,8 @@ def test_a_failure_model_is_used_and_starts_know_what_it_remembers_where_failure
 ) -> None:
     failures = FailureModel(FailureShape(4, 2, TASK.timestep_s, members=1)).eval()
     foresees = replace(grounding, failures=failures)
-    config = WorldConfig(reward=reward, data_start_share=0.5)
-    starts = data_starts(TASK, config, episodes, foresees)
+    config = simulator_env.WorldConfig(reward=reward, data_start_share=0.5)
+    starts = simulator_env.data_starts(TASK, config, episodes, foresees)
     assert starts is not None and starts.hidden is not None
     world: Any = built(config, foresees, starts=starts).simulator
     assert world.failures is (failures if prices else None)
@@ -271,7 +263,7 @@ def test_a_failure_model_is_used_and_starts_know_what_it_remembers_where_failure
 def test_recorded_starts_come_with_the_history_before_them(
     episodes: PairedEpisodes, grounding: HistoryGrounding
 ) -> None:
-    starts = data_starts(TASK, FROM_DATA, episodes, grounding)
+    starts = simulator_env.data_starts(TASK, FROM_DATA, episodes, grounding)
     assert starts is not None and starts.hidden is not None and len(starts.state) == len(starts.hidden) == 700
     windows, model = episodes.windows, grounding.model
     inputs = model.encoder_input(windows.state, windows.goal, windows.previous_action)
@@ -315,7 +307,7 @@ def recorded(failing: dict[float, int], lengths: tuple[float, ...] = (SHORT, LON
 def test_it_is_one_where_failures_are_half_as_frequent_again_above(
     failing: dict[float, int], lengths: tuple[float, ...], expected: float
 ) -> None:
-    assert command_limit(TASK, recorded(failing, lengths)) == expected
+    assert simulator_env.command_limit(TASK, recorded(failing, lengths)) == expected
 
 
 def test_commands_of_the_last_second_count() -> None:
@@ -323,4 +315,4 @@ def test_commands_of_the_last_second_count() -> None:
     whole = recorded({LONG: 12})
     windows, late = whole.windows, torch.arange(30)[:, None] >= 10
     gone = replace(windows, action=torch.where(late, windows.action * 0.5 / LONG, windows.action))
-    assert command_limit(TASK, replace(whole, windows=gone)) == NO_LIMIT
+    assert simulator_env.command_limit(TASK, replace(whole, windows=gone)) == NO_LIMIT

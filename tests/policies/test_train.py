@@ -15,26 +15,18 @@ from astra_data.core.progress import Progress, silent
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.model import GroundingModel, GroundingShape
 from astra_data.grounding.simulator import NO_GROUNDING, Grounding
+from astra_data.policies import train
 from astra_data.policies.episodes import Reached
 from astra_data.policies.networks import ActorCritic, ActorCriticShape
 from astra_data.policies.ppo import Ppo
 from astra_data.policies.running_policy import PolicyFile
 from astra_data.policies.simulator_env import RewardSource, Simulation, WorldConfig
-from astra_data.policies.train import (
-    AnyTrainConfig,
-    InSimulator,
-    PpoTrainConfig,
-    SacTrainConfig,
-    Training,
-    optimize,
-    with_restarts,
-)
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.task import Task
 from astra_data.worlds.variation import PlanarVariation
 
 TASK = TASKS["antmaze-umaze"]
-PPO = PpoTrainConfig(num_envs=4, rollout_steps=4, total_steps=4 * 4 * 3, hidden_sizes=(8, 6), memory_size=5)
+PPO = train.PpoTrainConfig(num_envs=4, rollout_steps=4, total_steps=4 * 4 * 3, hidden_sizes=(8, 6), memory_size=5)
 
 
 class ToyWorld(GoToZero):
@@ -43,14 +35,14 @@ class ToyWorld(GoToZero):
 
 def training(
     folder: Path,
-    config: PpoTrainConfig | SacTrainConfig = PPO,
+    config: train.PpoTrainConfig | train.SacTrainConfig = PPO,
     *,
     task: Task = TASK,
     grounding: Grounding = NO_GROUNDING,
     settings: PlanarVariation | None = None,
     progress: Progress = silent,
     seed: int = 0,
-) -> Training:
+) -> train.Training:
     torch.manual_seed(0)
     state = torch.tensor([-4.0, 4.0, 0.0, 0.0]).expand(2, 6, 4) + 0.1 * torch.randn(2, 6, 4)
     episodes = toy_episodes(
@@ -60,7 +52,7 @@ def training(
         simulated_next=state + 0.1 * torch.randn_like(state),
         goal=torch.zeros(2, 6, 2),
     )
-    return Training(task, config, settings, episodes, grounding, None, seed, "cpu", folder, progress)
+    return train.Training(task, config, settings, episodes, grounding, None, seed, "cpu", folder, progress)
 
 
 def grounding() -> HistoryGrounding:
@@ -69,11 +61,11 @@ def grounding() -> HistoryGrounding:
 
 
 def test_the_learner_that_is_named_has_the_settings_ppo_by_default() -> None:
-    read: TypeAdapter[PpoTrainConfig | SacTrainConfig] = TypeAdapter(AnyTrainConfig)
-    assert type(read.validate_python({})) is PpoTrainConfig
-    assert type(read.validate_python({"learner": "ppo", "rollout_steps": 9})) is PpoTrainConfig
+    read: TypeAdapter[train.PpoTrainConfig | train.SacTrainConfig] = TypeAdapter(train.AnyTrainConfig)
+    assert type(read.validate_python({})) is train.PpoTrainConfig
+    assert type(read.validate_python({"learner": "ppo", "rollout_steps": 9})) is train.PpoTrainConfig
     sac = read.validate_python({"learner": "sac", "burn_in": 3})
-    assert (type(sac), sac.num_envs) == (SacTrainConfig, 32) and read.validate_python(sac) is sac
+    assert (type(sac), sac.num_envs) == (train.SacTrainConfig, 32) and read.validate_python(sac) is sac
     with pytest.raises(ValidationError, match="burn_in"):
         read.validate_python({"burn_in": 3})
 
@@ -103,10 +95,10 @@ class Counting(Ppo):
 
 
 def counted(
-    given: Training, figures: Callable[[int], dict[str, float]] = lambda step: {"success": 0.5}
+    given: train.Training, figures: Callable[[int], dict[str, float]] = lambda step: {"success": 0.5}
 ) -> tuple[Counting, dict[str, Any]]:
     learner = Counting(ToyWorld(2), figures)
-    return learner, optimize(learner, learner.env, given)  # type: ignore[arg-type]
+    return learner, train.optimize(learner, learner.env, given)  # type: ignore[arg-type]
 
 
 WALKER = TASKS["humanoid-kinematics"]
@@ -193,7 +185,7 @@ def test_rows_and_their_plus_rows_differ_by_the_plus_settings_alone(
     monkeypatch.setattr("astra_data.policies.train.command_limit", lambda task, episodes: 0.85)
     given = training(tmp_path, PPO.model_copy(update={"data_start_share": 0.6}), grounding=grounding())
     (plain, known), (plus, priced) = (
-        InSimulator(reward=reward).world(replace(given, is_plus=is_plus)) for is_plus in (False, True)
+        train.InSimulator(reward=reward).world(replace(given, is_plus=is_plus)) for is_plus in (False, True)
     )
     assert known.world == WorldConfig(reward=reward, data_start_share=0.6)
     changes = {"reward": "priced", "change_penalty": 0.02, "command_limit": 0.85}
@@ -209,12 +201,12 @@ def test_each_try_has_its_part_of_the_progress_and_a_policy_says_what_it_learned
     config = PPO.model_copy(update={"tries": 2})
     given = training(tmp_path, config, progress=lambda share, note: notes.append((share, note)))
 
-    def learn(one: Training) -> tuple[PolicyFile, dict[str, Any]]:
+    def learn(one: train.Training) -> tuple[PolicyFile, dict[str, Any]]:
         one.progress(0.5, "half")
         return one.learned(ActorCritic(ActorCriticShape(8, 2)), Simulation(WorldConfig())), {"points": []}
 
     monkeypatch.setattr("astra_data.policies.train.reached_in_own_world", lambda *_: Reached(0.0, 1.0))
-    learned, _ = with_restarts(learn, given, None)
+    learned, _ = train.with_restarts(learn, given, None)
     assert notes == [(0.25, "try 1 of 2  half"), (0.75, "try 2 of 2  half")]
     assert (learned.dataset, learned.content_hash) == (given.episodes.reference, given.episodes.content_hash)
     assert learned.dataset != learned.content_hash and learned.observed == "abstract"

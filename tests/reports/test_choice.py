@@ -10,6 +10,7 @@ import pytest
 from scipy.stats import binom
 
 from astra_data.core.errors import BadInputError
+from astra_data.reports.artifacts import read_json
 from astra_data.reports.choice import (
     LEAST_TRIALS,
     PSEUDO_TRIALS,
@@ -27,7 +28,6 @@ from astra_data.reports.choice import (
     least_trials,
     posterior,
     read_judged,
-    read_trials,
     select_page,
     standings,
     widest_field,
@@ -126,9 +126,8 @@ BEGUN = TrialsFile(trials=9, field=2, pseudo_trials=4, rounds=[FIRST])
 
 
 def test_the_page_says_who_was_tried_how_often_with_what_success(tmp_path: Path) -> None:
-    assert read_trials(tmp_path / TRIALS) is None
     (tmp_path / TRIALS).write_text(BEGUN.model_dump_json())
-    assert read_trials(tmp_path / TRIALS) == BEGUN and BEGUN.spent == 4
+    assert read_json(TrialsFile, tmp_path / TRIALS) == BEGUN and BEGUN.spent == 4
     assert "Trials in the target" not in select_page("cart", JUDGED)
     page = select_page("cart", JUDGED, BEGUN)
     ahead = "ASTRA, seed 1 is ahead, with a success of 0.50 [0.09, 0.91]. NAS, seed 1, with 1.00 [0.34, 1.00]"

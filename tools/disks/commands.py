@@ -10,20 +10,7 @@ import h5py
 import numpy as np
 from mcap.writer import Writer
 
-from astra_data.dataset.columns import (
-    ACTION,
-    DONE,
-    GOAL,
-    NEXT_STATE,
-    OUTCOME_COLUMNS,
-    REWARD,
-    STATE,
-    SUCCESS,
-    TERMINATED,
-    TRUNCATED,
-    Column,
-    Episode,
-)
+from astra_data.dataset import columns as keys
 from astra_data.dataset.writer import DatasetWriter
 from disks import looks
 
@@ -186,26 +173,31 @@ def make_inputs(given: Path, run: Callable[[str], object], names: Collection[str
 
 def _write_walks(root: Path, name: str, uids: Sequence[int]) -> None:
     """Write a dataset with every column that an export needs, an episode of 5 to 7 steps for each uid."""
-    columns = [Column(STATE, size=3), Column(NEXT_STATE, size=3), Column(ACTION, size=2), Column(GOAL, size=2)]
+    columns = [
+        keys.Column(keys.STATE, size=3),
+        keys.Column(keys.NEXT_STATE, size=3),
+        keys.Column(keys.ACTION, size=2),
+        keys.Column(keys.GOAL, size=2),
+    ]
     description = {"name": name, "stage": "collect", "environment": {"id": "walk"}}
-    with DatasetWriter(root, [*columns, *OUTCOME_COLUMNS], fps=20, task="walk", description=description) as writer:
+    with DatasetWriter(root, [*columns, *keys.OUTCOME_COLUMNS], fps=20, task="walk", description=description) as writer:
         for number, uid in enumerate(uids):
             length = 5 + number
             rng = np.random.default_rng(uid)
             states = rng.normal(size=(length + 1, 3)).astype(np.float32)
             is_last = np.arange(length) == length - 1
             values = {
-                STATE: states[:-1],
-                NEXT_STATE: states[1:],
-                ACTION: rng.normal(size=(length, 2)).astype(np.float32),
-                GOAL: np.ones((length, 2), np.float32),
-                REWARD: rng.normal(size=length).astype(np.float32),
-                TERMINATED: is_last,
-                TRUNCATED: np.zeros(length, bool),
-                DONE: is_last,
-                SUCCESS: is_last,
+                keys.STATE: states[:-1],
+                keys.NEXT_STATE: states[1:],
+                keys.ACTION: rng.normal(size=(length, 2)).astype(np.float32),
+                keys.GOAL: np.ones((length, 2), np.float32),
+                keys.REWARD: rng.normal(size=length).astype(np.float32),
+                keys.TERMINATED: is_last,
+                keys.TRUNCATED: np.zeros(length, bool),
+                keys.DONE: is_last,
+                keys.SUCCESS: is_last,
             }
-            writer.add(Episode(uid, values, {"success": True}))
+            writer.add(keys.Episode(uid, values, {"success": True}))
 
 
 def _write_logs(given: Path) -> None:

@@ -19,7 +19,7 @@ from astra_data.dataset import columns as names
 from astra_data.dataset import description as described
 from astra_data.dataset import format as layout
 from astra_data.dataset import plain
-from astra_data.dataset.cameras import clip_fault, read_cameras
+from astra_data.dataset.cameras import clip_fault, pooled, read_cameras
 from astra_data.dataset.columns import Array
 from astra_data.dataset.parquet import read_blocks
 from astra_data.dataset.reader import Dataset, format_fault, refuse_run, refuse_versions
@@ -282,32 +282,18 @@ class EpisodeChecks:
                 self.report.fault("meta/episodes", fault)
         if not self.digests:
             statistics = dict(zip(layout.STATISTICS, episode_statistics(run.columns.values()), strict=True))
-            statistics["count"] = np.full(statistics["min"].shape, float(len(run)))
-            self._add(statistics)
+            statistics["count"] = np.array([len(run)])
+            every = pooled([self.total, statistics] if self.total else [statistics])
+            self.total = {kind: np.array(values) for kind, values in every.items()}
             self._compare(lambda name, kind: row.get(f"stats/{name}/{kind}"), statistics, f" in episode {number}")
-
-    def _add(self, found: Mapping[str, Floats]) -> None:
-        """Take an episode's statistics into those of all rows."""
-        old = self.total or found
-        count = self.total.get("count", 0.0) + found["count"]
-        share, shift = found["count"] / count, found["mean"] - old["mean"]
-        variance = old["std"] ** 2 * (1 - share) + found["std"] ** 2 * share
-        self.total = {
-            "min": np.minimum(old["min"], found["min"]),
-            "max": np.maximum(old["max"], found["max"]),
-            "mean": old["mean"] + shift * share,
-            "std": np.sqrt(variance + shift**2 * share * (1 - share)),
-            "count": count,
-        }
 
     def _compare(self, stored: Callable[[str, str], object], found: Mapping[str, Floats], where: str) -> None:
         """Note which statistics, as `stored` has them by column and kind, differ from those of the values."""
         for column, part in side_by_side(self.columns):
             largest = np.maximum(np.abs(found["min"][part]), np.abs(found["max"][part]))
             for kind in plain.PLAIN_STATISTICS:
-                one, expected = stored(column.name, kind), found[kind][part]
-                if kind == "count":
-                    expected = expected[:1].astype(np.int64)
+                one, expected = stored(column.name, kind), found[kind]
+                expected = expected if kind == "count" else expected[part]
                 if not is_estimate(kind, one, expected, largest):
                     what = f"{kind} of {column.name}{where} is {one}, expected {expected.tolist()}"
                     self.report.note("statistics", f"statistics: {what}")

@@ -51,15 +51,10 @@ def repair(
     without a footer, which a killed writer leaves, are read page by page. Statistics and meta/episodes are
     rebuilt. What LeRobot recorded without next states becomes what `Dataset.open` makes of it.
 
-    Args:
-        folder: the damaged dataset; it is not changed.
-        out: folder of the new one.
-        like: the dataset from which LeRobot's tools made `folder`, dropping our metadata: provenance and the
-            episodes' metadata are taken from it, joined by episode_uid and values. Or several, of which the
-            first gives the provenance. An episode with the uid of one of theirs and other values is left
-            out, or, with `new_uids`, has no metadata.
-        new_uids: give an episode whose uid an earlier one has a new one, the same in every run, and keep the
-            old one as "merged_uid"; otherwise it is left out.
+    `like` are the datasets from which LeRobot's tools made `folder`, dropping our metadata: the episodes' metadata are
+    taken from them, joined by episode_uid and values, the provenance from the first. An episode with the uid of one of
+    theirs and other values is left out, or, with `new_uids`, has no metadata. With these, an episode whose uid an
+    earlier one has gets a new one, the same in every run, and the old one as "merged_uid"; otherwise it is left out.
     """
     if not folder.is_dir():
         raise BadInputError(f"{folder}: expected the folder of a dataset, got no folder")

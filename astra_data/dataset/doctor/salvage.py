@@ -45,8 +45,8 @@ def whole_runs(
     An episode after rows that are lost is known by its own number and rows, where they agree with meta/episodes or,
     without that, where both are greater than those that should follow.
     """
-    found = plain.read_object(folder / INFO_PATH)
-    info = found if isinstance(found, dict) else {}
+    known = plain.read_object(folder / INFO_PATH)
+    info = known if isinstance(known, dict) else {}
     places, faults = plain.read_places(folder, info)
     notes += [f"meta/episodes was rebuilt from the data: {fault}" for fault in faults]
     if not places and not faults:
@@ -57,7 +57,10 @@ def whole_runs(
     episode = row = 0
     uids: set[int] = set()
     for run, is_cut in _every_run(folder, columns, notes):
-        number, first, frame = _claimed(run)
+        # As most rows tell: the episode, its first row in the dataset and its first frame.
+        steps, found = np.arange(len(run)), run.columns
+        claimed = found[names.EPISODE_INDEX], found[names.INDEX] - steps, found[names.FRAME_INDEX] - steps
+        number, first, frame = (int(np.sort(values)[len(run) // 2]) for values in claimed)
         place = places.get(number)
         if frame > 0 or (is_cut and (place is None or place.length != len(run))):
             if is_cut:
@@ -93,13 +96,6 @@ def whole_runs(
         episode, row = episode + 1, row + len(run)
     if places and episode <= max(places):
         notes.append(_lost(episode, max(places)))
-
-
-def _claimed(run: plain.Run) -> tuple[int, ...]:
-    """Return the episode, the first row in the dataset and the first frame that most rows of `run` tell."""
-    steps, columns = np.arange(len(run)), run.columns
-    recorded = columns[names.EPISODE_INDEX], columns[names.INDEX] - steps, columns[names.FRAME_INDEX] - steps
-    return tuple(int(np.sort(values)[len(run) // 2]) for values in recorded)
 
 
 def _lost(first: int, last: int) -> str:

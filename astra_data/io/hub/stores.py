@@ -21,11 +21,9 @@ if TYPE_CHECKING:
     from huggingface_hub import HfApi
 
 KIND = "dataset"
-TEXT_BYTES = 2**26
-"""Most bytes of a description or of SHA256SUMS; some hundred thousand recordings or files fit into it."""
+TEXT_BYTES = 2**26  # most bytes of a description or of SHA256SUMS: of some hundred thousand recordings or files
 BLOCK_BYTES = 2**24  # bytes per request
-EXTRAS = {"s3": "s3", "s3a": "s3", "gs": "gcs", "gcs": "gcs"}
-"""Protocol → the extra of this package that is needed for it."""
+EXTRAS = {"s3": "s3", "s3a": "s3", "gs": "gcs", "gcs": "gcs"}  # protocol → the extra that is needed for it
 
 SUMS_PATH = "SHA256SUMS"
 _NUMBERED = r"chunk-[0-9]{3,}/file-[0-9]{3,}\.parquet"

@@ -256,8 +256,7 @@ class Timeline:
 
 
 SUFFIXES = (".mcap",)
-Message = tuple[int, Mapping[str, Array]]
-"""The time of a message in ns, by the recorder's clock, and the values of its fields."""
+Message = tuple[int, Mapping[str, Array]]  # time in ns, by the recorder's clock, and values of fields
 _MISSING = object()
 _NAMES = "name"  # the part of a message that names the values of the lists beside it, as of joints in ROS
 

@@ -24,8 +24,7 @@ from astra_data.grounding.paired_episodes import PairedEpisodes, PairedWindows
 from astra_data.reports.artifacts import METRICS
 
 _MEASURED_EVERY = 100
-_BANDWIDTHS = (0.25, 0.5, 1.0, 2.0)
-"""Bandwidths of the MMD's kernels, in units of the square root of the latent's size."""
+_BANDWIDTHS = (0.25, 0.5, 1.0, 2.0)  # of the MMD's kernels, in units of the square root of the latent's size
 
 
 class AlignConfig(WindowedConfig):
@@ -93,10 +92,7 @@ def align(
     encoder = TargetEncoder(episodes.target_state.shape[-1], shape.goal_size, shape.action_size, **alike).to(device)
     # Where φ drops the robot's place, latents must not depend on where it came from.
     encoder.set_scales(
-        training.steps(training.target_state),
-        training.steps(training.windows.goal),
-        training.dropped_place,
-        abstract,
+        training.steps(training.target_state), training.steps(training.windows.goal), training.dropped_place, abstract
     )
     bandwidths = torch.tensor(_BANDWIDTHS, device=device) * shape.latent_size**0.5
     grounding_digest = file_digest(grounding_file)

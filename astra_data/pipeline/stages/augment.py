@@ -43,6 +43,9 @@ Rotations = Literal["quarter", "any", "none"]
 
 _SHIFTS = 64  # shifts that are tried for each rotation
 _ROUNDING = 1e-6  # how far a rotated command may exceed the limit
+_log = logging.getLogger(__name__)
+DEFAULT_COPIES = 3
+_OUTCOMES = tuple(column.name for column in OUTCOME_COLUMNS)
 
 
 def positions(task: Task, states: Array) -> Array:
@@ -139,12 +142,6 @@ def outcomes(objective: Objective, before: Array, after: Array, goal: Array, top
         names.DONE: done,
         names.SUCCESS: success.numpy()[:length],
     }
-
-
-_log = logging.getLogger(__name__)
-
-DEFAULT_COPIES = 3
-_OUTCOMES = tuple(column.name for column in OUTCOME_COLUMNS)
 
 
 class AugmentConfig(Config):
@@ -251,7 +248,8 @@ def augment(
                     "augmentation_x_m": change.shift_m[0],
                     "augmentation_y_m": change.shift_m[1],
                 }
-                writer.add(Episode(_free_uid(derive(seed, purpose), taken), columns, metadata))
+                taken.add(uid := names.new_uid(derive(seed, purpose), b"", taken))
+                writer.add(Episode(uid, columns, metadata))
                 placed += 1
             progress((index + 1) / len(source), f"{placed} copies, no place for {lost}")
         if copies.any() and not placed:
@@ -322,10 +320,3 @@ def _shares(source: Dataset, mover: Relocation, config: AugmentConfig, seed: int
         copies[usable] = each
         copies[training[usable[training]][:more]] += 1
     return held_out, copies
-
-
-def _free_uid(uid: int, taken: set[int]) -> int:
-    while uid in taken:
-        uid = (uid + 1) % 2**63
-    taken.add(uid)
-    return uid

@@ -39,6 +39,15 @@ _CHOICES = 16  # random commands to choose one from that stays clear of walls
 
 HoldTimes = Annotated[tuple[NotNegative, NotNegative], AfterValidator(in_order)]
 """The shortest and the longest time for which a random command is held."""
+_PPO_ENVS = 128
+_SAC_ENVS = 32  # target environments stepped side by side
+_SAC = SacConfig(buffer_size=1_000_000)  # settings with which the humanoid learns to stay up; its rewards are 5 a step
+_SAC_SIZES = (256, 256)  # hidden layers of actor and critics
+_TEST_EPISODES = 32  # test episodes after each iteration
+_TRAINING_SHARE = 0.8  # share of the progress bar for training the suboptimal policy
+_NUM_ENVS = 200  # episodes recorded in one batch
+_SAC_STEPS, _SAC_EPISODE_STEPS = 300_000, 500  # steps of the training; it stops where test episodes last this long
+MOST_STEPS = 10**10  # upper bound of the steps of a dataset; it would take terabytes
 
 
 def held_steps(hold_s: HoldTimes, timestep_s: float) -> tuple[int, int]:
@@ -205,18 +214,10 @@ def record(
     return steps
 
 
-_PPO_ENVS = 128
-_SAC_ENVS = 32  # target environments stepped side by side
-
-_SAC = SacConfig(buffer_size=1_000_000)  # settings with which the humanoid learns to stay up; its rewards are 5 a step
-_SAC_SIZES = (256, 256)  # hidden layers of actor and critics
-
 type Judge = Callable[[Mapping[str, float]], tuple[float, str]]
 """Given the figures of an iteration, returns the share done and a note."""
 type Metadata = dict[str, Any]
 """What a dataset records about the behavior."""
-
-_TEST_EPISODES = 32  # test episodes after each iteration
 
 
 def suboptimal_by_ppo(
@@ -252,12 +253,7 @@ def suboptimal_by_sac(
 
 
 def _trained(
-    learner: Ppo | Sac,
-    world: ObservedTargetEnv,
-    judge: Judge,
-    folder: Path,
-    progress: Progress,
-    observed: Observed,
+    learner: Ppo | Sac, world: ObservedTargetEnv, judge: Judge, folder: Path, progress: Progress, observed: Observed
 ) -> tuple[PolicyFile, Metadata]:
     """Train until `judge`, given the figures of an iteration, returns a share done of 1, with a note."""
 
@@ -294,13 +290,6 @@ def _lasts(running: RunningPolicy, seed: int, num_threads: int | None) -> float:
         lasted += int(active.sum())
         active &= ~env.step(behavior.act(env.state, env.goal), active).terminated
     return lasted / _TEST_EPISODES
-
-
-_TRAINING_SHARE = 0.8  # share of the progress bar for training the suboptimal policy
-_NUM_ENVS = 200  # episodes recorded in one batch
-_SAC_STEPS, _SAC_EPISODE_STEPS = 300_000, 500
-"""SAC's training of a suboptimal policy stops after so many steps, or once test episodes last this long."""
-MOST_STEPS = 10**10  # upper bound of the steps of a dataset; it would take terabytes
 
 
 class CollectConfig(Config):

@@ -25,8 +25,7 @@ from astra_data.reports.choice import FOLDER, SELECTED, Candidate, Judged, selec
 from astra_data.reports.runs import Reported
 from astra_data.robots.registry import task_named
 
-_BEGUN = "begun.json"
-"""Digests of a policy and of its judge → success, of a choice that was interrupted."""
+_BEGUN = "begun.json"  # digests of a policy and of its judge → success, of a choice that was interrupted
 
 
 class SelectConfig(Config):

@@ -22,8 +22,11 @@ from astra_data.reports.runs import SHARED_WORLDS
 
 CURVE_POINTS = 200  # points at which curves of different seeds are interpolated
 PANELS_ACROSS = 4  # learning-curve panels side by side, at most
-_DOT: dict[str, Any] = {"mfc": "white", "mec": style.INK, "clip_on": False}
-"""Not clipped: the axis would cut what lies on 0 in half."""
+_DOT: dict[str, Any] = {"mfc": "white", "mec": style.INK, "clip_on": False}  # the axis would cut what lies on 0
+SAME = 0.01  # ungrounded simulators whose errors differ by less than this share are drawn once
+_UNITS = {"_m_s2": "m/s²", "_rad_s": "rad/s", "_m_s": "m/s", "_rad": "rad", "_deg": "°", "_m": "m"}
+"""Endings of the names of quantities."""
+_TICKS = (0.01, 0.1, 0.3, 0.6, 1.0)
 
 
 @style.style()
@@ -158,11 +161,6 @@ def _covered(results: Results, scene: style.Scene) -> Mapping[str, list[Map]]:
     return {}
 
 
-SAME = 0.01  # ungrounded simulators whose errors differ by less than this share are drawn once
-_UNITS = {"_m_s2": "m/s²", "_rad_s": "rad/s", "_m_s": "m/s", "_rad": "rad", "_deg": "°", "_m": "m"}
-"""Endings of the names of quantities."""
-
-
 @style.style()
 def open_loop_error(results: Results, _: style.Scene) -> Figure | None:
     """Draw the error over the horizon, one panel per quantity (named with its unit), on logarithmic axes."""
@@ -197,9 +195,6 @@ def open_loop_error(results: Results, _: style.Scene) -> Figure | None:
     handles, labels = grid[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside right center", handlelength=2.4)
     return figure
-
-
-_TICKS = (0.01, 0.1, 0.3, 0.6, 1.0)
 
 
 @style.style()

@@ -56,8 +56,7 @@ def replay_commands(task: Task) -> tuple[Floats, Floats, Floats, Floats]:
 
 COLUMNS, PANEL_INCHES = 4, 2.0  # panels side by side, at most, and the width of one
 TITLE_POINTS, TITLE_LETTERS = 10.0, 17  # font size of a panel's title; one of more letters is smaller
-TIMES_S = (0.0, 0.5, 1.0, 1.5, 2.0, 4.0, 8.0)
-"""Times at which pictures of an episode are taken, in addition to the time limit."""
+TIMES_S = (0.0, 0.5, 1.0, 1.5, 2.0, 4.0, 8.0)  # of the pictures of an episode, in addition to the time limit
 PICTURE_INCHES = 0.95  # width of such a picture
 RIM = 0.35  # visible width of the outer walls, in cells
 
@@ -71,7 +70,7 @@ def trajectories(results: Results, scene: Scene) -> Figure | None:
     points = np.concatenate([*found, np.empty((0, 2))])
     if not np.isfinite(points).any():
         return None
-    points = maze.free_centers() if maze else points
+    points = np.array([maze.cell_center(*cell) for cell in maze.free_cells()]) if maze else points
     low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
     # Part of the outer walls, or a tenth of the larger side.
     rim = (0.5 + RIM) * maze.scale if maze else max(0.1 * float((high - low).max()), 0.1)

@@ -65,12 +65,6 @@ def standing_pose(count: int) -> Floats:
     return qpos
 
 
-def up_cosine(quaternion: Floats) -> Floats:
-    """Return the cosine (B,) between the torso's up axis and the vertical, from `quaternion` (B, 4) wxyz."""
-    _, x, y, _ = quaternion.T
-    return np.asarray(1.0 - 2.0 * (x * x + y * y))
-
-
 def canonical_view(qpos: Floats, qvel: Floats, command: Floats) -> tuple[Floats, NDArray[np.intp]]:
     """Return body and command (B, 2) in the heading frame (B, 28), turned by quarters (B,) toward the command."""
     rotation = rotation_matrix(qpos[:, 3:7])
@@ -199,7 +193,7 @@ class AntMazeEnv(PhysicsTarget, PlanarTarget):
         before = self.position
         torques = self.controller(self.physics.qpos, self.physics.qvel, command)
         self.physics.step(torques, None if active is None else active.numpy())
-        toppled = up_cosine(self.physics.qpos[:, 3:7]) < TOPPLE_COSINE
+        toppled = rotation_matrix(self.physics.qpos[:, 3:7])[:, 2, 2] < TOPPLE_COSINE
         return self._judged(before, self.position, toppled)
 
 

@@ -34,8 +34,7 @@ FOOT_RADIUS_M = 0.075
 
 POSITIONS = 24  # qpos: x, y, z, quaternion, 17 joint angles
 STATE_SIZE = 47  # qpos, then qvel (23): linear, angular, 17 joint rates
-STANDING = (0.0, 0.0, 1.4, 1.0, *[0.0] * 43)
-"""The state in which the model starts: upright, at rest, every joint at zero."""
+STANDING = (0.0, 0.0, 1.4, 1.0, *[0.0] * 43)  # the state in which the model starts: upright, at rest, joints at zero
 CONTROL_SUBSTEPS = 5  # physics steps per control step: 5 x 0.003 s, as in Gymnasium
 TIMESTEP_S = 0.015
 
@@ -43,8 +42,7 @@ STIFFNESS = 200.0  # in N m/rad: the paper's proportional gain
 DAMPING = 10.0  # in N m s/rad: the paper's derivative gain
 MOTOR_RANGE = 0.4  # Gymnasium's motors take controls of ±0.4, times their gear the torque in N m
 
-CONTACT_M = 0.002
-"""A foot touches the floor when its sole is closer to it than this: the sum of both margins in the model."""
+CONTACT_M = 0.002  # a foot touches the floor when its sole is closer: the sum of both margins in the model
 
 Actuators = Literal["positions", "motors"]
 

@@ -227,8 +227,7 @@ class Walking(Objective):
     phi: ClassVar[humanoid.Phi]  # φ of target states (count, 47), (count, X)
 
     locomotion: humanoid.Locomotion = field(default_factory=humanoid.Locomotion)  # rewards and starts of the target
-    failure_reward: float = field(default=-5.0, kw_only=True)
-    """Minus the reward for staying up, which a step that ends in a fall does not get."""
+    failure_reward: float = field(default=-5.0, kw_only=True)  # a step that ends in a fall is not paid for staying up
 
     def observe(self, state: Tensor, goal: Tensor) -> Tensor:
         """Return the deviations of states (..., X) from standing, in spreads and clipped to ±5, (..., X)."""

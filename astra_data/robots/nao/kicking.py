@@ -19,6 +19,12 @@ from astra_data.worlds.plane.point_mass import PlanarStates
 ROLLING_M_S2 = 0.30  # deceleration of the ball of RoboCup's Standard Platform League (B-Human's ballSpecification)
 BALL_RADIUS_M = 0.05  # of the same ball
 _KICKS_ABOVE = 0.5  # a third entry of a command above this asks for a kick
+_LIES_M_S = 0.15  # a slower ball lies: it would roll for 4 cm at most, and estimates of its speed are never quite zero
+_LEAVES_M_S = 0.5  # least speed with which corrections set a ball rolling that lay, as the NAO's kicks did
+_NOTHING_M_S = 0.05  # corrections to less than this set no ball rolling: scatter alone is as fast
+_TURN_RAD = 0.4  # deviation of the ways in which hit balls leave from the simulator's, as in recorded kicks of the NAO
+_FADES = 0.75  # share of the evidence of a hit that counts in the next step: a foot meets the ball within four steps
+_NEAR_M = (0.18, 0.5)  # distances from the ball at which recorded episodes begin; a foot reaches as far as the first
 
 
 def asks_to_kick(command: Tensor) -> Tensor:
@@ -70,16 +76,6 @@ def kick_away(body: Tensor, ball: Tensor, velocity: Tensor, asked: Tensor, conta
     """Return the velocities (B, 2) of balls, of which bodies that are `asked` (B, 1) kick those within reach."""
     _, within, leaving = contact.of(body, ball)
     return torch.where(asked & within, leaving, velocity)
-
-
-_LIES_M_S = 0.15
-"""A ball that is not faster lies: it would roll on for at most 4 cm, and a robot's estimate of its speed is
-never quite zero."""
-_LEAVES_M_S = 0.5
-"""Least speed with which corrections set a ball rolling that lay; the NAO's did about that in its kicks."""
-_NOTHING_M_S = 0.05  # corrections to less than this set no ball rolling: scatter alone is as fast
-_TURN_RAD = 0.4  # deviation of the ways in which hit balls leave from the simulator's, as in recorded kicks of the NAO
-_FADES = 0.75  # share of the evidence of a hit that counts in the next step: a foot meets the ball within four steps
 
 
 class BallAgent(PlanarStates):
@@ -164,9 +160,6 @@ class BallAgent(PlanarStates):
         still = torch.cat([ball, torch.zeros_like(ball)], dim=-1)
         self.reset_to(torch.cat([moved[:, :4], torch.where(rolls, rolled, still)], dim=-1))
         return self.state
-
-
-_NEAR_M = (0.18, 0.5)  # distances from the ball at which recorded episodes begin; a foot reaches as far as the first
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,14 @@ from astra_data.worlds.simulators import PHYSICS_STATE, BatchedPhysics, add_wall
 
 SUBSTEPS = 3  # physics steps per tick: 4 ms each
 WALL_HEIGHT_M = 0.5
+TICKS = 16  # per control step
+FALLEN_COSINE = 0.7  # a robot has fallen when the cosine between its up axis and the vertical is below this (45°)
+MOTORS = len(walk.TO_MOTORS)
+# Ankles among the motors: pitch, roll; left, right.
+_ANKLES = ((4, 5), (10, 11))
+CONTROL_STEP_S = TICKS * walk.TICK_S
+_BALL = 7 + MOTORS
+_MIDDLE_M = 0.03  # either foot may kick a ball that is less far to the side: the torso sways as far from step to step
 
 
 def nao_model(maze: Maze | None = None, *, ball: bool = False) -> mujoco.MjModel:
@@ -35,14 +43,6 @@ def nao_model(maze: Maze | None = None, *, ball: bool = False) -> mujoco.MjModel
     if maze:
         add_walls(world, maze, WALL_HEIGHT_M, contype="2")
     return mujoco.MjModel.from_xml_string(ElementTree.tostring(root, encoding="unicode"))
-
-
-TICKS = 16  # per control step
-FALLEN_COSINE = 0.7  # a robot has fallen when the cosine between its up axis and the vertical is below this (45°)
-MOTORS = len(walk.TO_MOTORS)
-
-# Ankles among the motors: pitch, roll; left, right.
-_ANKLES = ((4, 5), (10, 11))
 
 
 class BatchedBodies(BatchedPhysics):
@@ -151,11 +151,6 @@ class BatchedBodies(BatchedPhysics):
         geoms = data.contact.geom
         walls = (geoms >= first) & (geoms <= last)
         return bool((walls[:, ::-1] & self._robot_geoms[geoms]).any())
-
-
-CONTROL_STEP_S = TICKS * walk.TICK_S
-_BALL = 7 + MOTORS
-_MIDDLE_M = 0.03  # either foot may kick a ball that is less far to the side: the torso sways as far from step to step
 
 
 class BatchedNao:

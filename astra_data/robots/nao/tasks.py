@@ -341,10 +341,7 @@ _STATE = [
     *entries("planned_forward planned_left", "m/s", "body", "invariant"),
     ColumnEntry("planned_turn", "rad/s", "body", "invariant"),
 ]
-_ROLLING = [
-    *entries("ball_x ball_y", "m", "world", "position"),
-    *entries("ball_vx ball_vy", "m/s", "world", "vector"),
-]
+_ROLLING = [*entries("ball_x ball_y", "m", "world", "position"), *entries("ball_vx ball_vy", "m/s", "world", "vector")]
 _UNSEEN = ColumnEntry("ball_unseen", "s", "body", "invariant")
 _COMMAND = [*entries("command_vx command_vy", "0.25 m/s", "world", "vector")]
 _KICK = ColumnEntry("kick", "1", "body", "invariant")

@@ -21,8 +21,7 @@ TIBIA_M = 0.1029
 FOOT_HEIGHT_M = 0.04519
 _LEG = ("HipRoll", "HipPitch", "KneePitch", "AnklePitch", "AnkleRoll")
 JOINTS = ("HipYawPitch", *(f"{side}{name}" for side in "LR" for name in _LEG))  # the eleven angles, in order
-TO_MOTORS = np.array([0, 1, 2, 3, 4, 5, 0, 6, 7, 8, 9, 10])
-"""Which of the eleven angles each of the model's twelve controls follows."""
+TO_MOTORS = np.array([0, 1, 2, 3, 4, 5, 0, 6, 7, 8, 9, 10])  # which of the eleven angles each control follows
 
 _HIP = np.array([0.0, HIP_OFFSET_Y_M, -HIP_OFFSET_Z_M])
 _TILT = np.pi / 4
@@ -57,7 +56,8 @@ def leg_angles(poses: Floats) -> Floats:
     wanted = _wanted_hip_yaw_pitch(foot, ankle, knee, thigh_lead)
     shared = np.broadcast_to(wanted.mean(axis=-1, keepdims=True), wanted.shape)
 
-    hips = _hip_yaw_pitch(shared)
+    tilt = np.asarray(_TILT)
+    hips = about_x(-tilt) @ about_y(shared) @ about_x(tilt)  # about the left leg's tilted axis (0, 1, -1) / √2
     x, y, z = np.moveaxis((np.swapaxes(hips, -1, -2) @ ankle[..., None])[..., 0], -1, 0)
     hip_roll = np.arctan2(y, -z)
     hip_pitch = np.arctan2(-x, np.hypot(y, z)) - thigh_lead
@@ -68,12 +68,6 @@ def leg_angles(poses: Floats) -> Floats:
 
     legs = np.stack([hip_roll, hip_pitch, knee, ankle_pitch, ankle_roll], axis=-1)
     return np.concatenate([shared[..., 0, None], legs[..., 0, :], legs[..., 1, :] * _MIRRORED_LEG], axis=-1)
-
-
-def _hip_yaw_pitch(angle: Floats) -> Floats:
-    """Return rotations about the left leg's tilted axis (0, 1, -1) / √2."""
-    tilt = np.asarray(_TILT)
-    return np.asarray(about_x(-tilt) @ about_y(angle) @ about_x(tilt))
 
 
 def _triangle(distance: Floats) -> tuple[Floats, Floats]:

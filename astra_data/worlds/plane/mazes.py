@@ -65,10 +65,6 @@ class Maze:
         """Return the (row, column) of every free cell, row by row."""
         return [(int(row), int(column)) for row, column in np.argwhere(~self.walls)]
 
-    def free_centers(self) -> Floats:
-        """Return the centers (N, 2) of the free cells in m."""
-        return np.array([self.cell_center(row, column) for row, column in self.free_cells()])
-
     @cached_property
     def fine_walls(self) -> Bools:
         """The walls on a grid of `fine_m`, indexed [y, x] from the lower left corner."""

@@ -19,13 +19,6 @@ def test_json_that_is_too_large_is_told(tmp_path: Path, monkeypatch: pytest.Monk
         imported(tmp_path, path)
 
 
-def test_a_field_that_comes_twice_is_told(tmp_path: Path) -> None:
-    path = write_table(tmp_path / "log.json", rows())
-    path.write_text(path.read_text().rstrip().removesuffix("}") + ', "x": [0]}')
-    with pytest.raises(BadInputError, match="an object has x more than once"):
-        imported(tmp_path, path)
-
-
 LISTS = ImportMapping.model_validate(
     {"name": "n", "task": "t", "fps": 1, "columns": {name: {"fields": (name,)} for name in ("x", "on")}}
 )

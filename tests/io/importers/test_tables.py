@@ -59,3 +59,11 @@ def test_text_for_numbers_is_told(tmp_path: Path, name: str) -> None:
     path = write_table(tmp_path / name, fields | {"reward": np.full(20, b"much" if name == "log.h5" else "much")})
     with pytest.raises(BadInputError, match=r"field 'reward'.*expected numbers"):
         imported(tmp_path, path)
+
+
+@pytest.mark.parametrize("name", ["log.csv", "log.json"])
+def test_a_field_that_comes_twice_is_told(tmp_path: Path, name: str) -> None:
+    path = write_table(tmp_path / name, rows())
+    path.write_text(path.read_text().replace("unused", "x", 1))
+    with pytest.raises(BadInputError, match="has x more than once"):
+        imported(tmp_path, path)

@@ -4,18 +4,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from astra_data.dataset.columns import (
-    ACTION,
-    GOAL,
-    NEXT_STATE,
-    REWARD,
-    STATE,
-    SUCCESS,
-    TERMINATED,
-    TRUNCATED,
-    Array,
-    Episode,
-)
+from astra_data.dataset import columns as keys
 from astra_data.pipeline.stages.augment import Relocation, outcomes, positions
 from astra_data.robots.registry import TASKS
 
@@ -29,19 +18,19 @@ def relocation(**changes: Any) -> Relocation:
     return Relocation(TASK, **settings | {"tries": 100} | changes)
 
 
-def straight(start: tuple[float, float], end: tuple[float, float], steps: int) -> Episode:
+def straight(start: tuple[float, float], end: tuple[float, float], steps: int) -> keys.Episode:
     """Return an episode that slides from `start` to `end`, commanded along (1, 1)."""
     path = np.zeros((steps + 1, 29), np.float32)
     path[:, :2] = np.linspace(start, end, steps + 1)
     path[:, 3] = 1
-    columns = {STATE: path[:-1].copy(), NEXT_STATE: path[1:].copy()}
-    return Episode(0, {**columns, ACTION: np.full((steps, 2), 0.9, np.float32)})
+    columns = {keys.STATE: path[:-1].copy(), keys.NEXT_STATE: path[1:].copy()}
+    return keys.Episode(0, {**columns, keys.ACTION: np.full((steps, 2), 0.9, np.float32)})
 
 
 def test_only_what_keeps_its_distance_may_move() -> None:
     # The upper corridor is 4 m wide, its middle at y = 4 m; the path sags toward the wall and comes back.
     path = straight((-4.0, 4.0), (4.0, 4.0), 100)
-    for name in (STATE, NEXT_STATE):
+    for name in (keys.STATE, keys.NEXT_STATE):
         x = path.columns[name][:, 0]
         path.columns[name][:, 1] -= np.where(np.abs(x) < 1.0, 1.5, 0.0)
     (first, second) = relocation().stretches(path)
@@ -49,26 +38,26 @@ def test_only_what_keeps_its_distance_may_move() -> None:
     assert relocation(min_steps=40).stretches(path) == [] and relocation(margin_m=0.3).stretches(path) == [(0, 100)]
     assert relocation(min_steps=100, margin_m=0.3).stretches(path) == [(0, 100)]
     # Drawn in proportion to their lengths.
-    short = Episode(0, {name: values[25:] for name, values in path.columns.items()})
+    short = keys.Episode(0, {name: values[25:] for name, values in path.columns.items()})
     placed = relocation(rotations="none", translations=False, tries=400).placements(short, np.random.default_rng(0))
     firsts = [steps.start for _, steps in placed]
     assert len(firsts) == 400 and firsts.count(0) / 400 == pytest.approx(12 / 49, abs=0.07)
 
 
-def draws(count: int, episode: Episode, **changes: Any) -> list[Any]:
+def draws(count: int, episode: keys.Episode, **changes: Any) -> list[Any]:
     rng = np.random.default_rng(0)
     drawn = [next(relocation(**changes).placements(episode, rng), None) for _ in range(count)]
     assert None not in drawn
     return drawn
 
 
-def moved(change: Any, episode: Episode) -> Array:
-    return np.asarray(change.positions(positions(TASK, episode.columns[STATE]).astype(np.float64)))
+def moved(change: Any, episode: keys.Episode) -> keys.Array:
+    return np.asarray(change.positions(positions(TASK, episode.columns[keys.STATE]).astype(np.float64)))
 
 
 def test_quarter_turns_go_everywhere_that_is_free() -> None:
     path = straight((-4.5, 4.0), (-3.5, 4.0), 20)
-    drawn: Array = np.array([moved(change, path) for change, _ in draws(80, path)])
+    drawn: keys.Array = np.array([moved(change, path) for change, _ in draws(80, path)])
     ends = drawn.astype(np.float32)  # as they are stored
     assert (TASK.maze.clearance(ends.astype(np.float64)) > 1.3).all()
     bearing = np.arctan2(*(ends[:, -1] - ends[:, 0]).T[::-1])
@@ -85,7 +74,7 @@ def test_what_fits_nowhere_is_given_up() -> None:
     change, _ = next(relocation(translations=False, tries=50).placements(path, np.random.default_rng(0)))
     assert change.rotation_rad == 0.0
     long = straight((-4.5, 4.0), (4.5, 4.0), 60)
-    long.columns[ACTION][:] = 2.0
+    long.columns[keys.ACTION][:] = 2.0
     assert list(relocation(tries=5).placements(long, np.random.default_rng(0))) == []
 
 
@@ -93,7 +82,7 @@ def test_what_fits_nowhere_is_given_up() -> None:
 def test_an_episode_ends_at_the_goal_or_where_it_topples(toppled_at: int | None, length: int, success: bool) -> None:
     # 0.1 m per step along the lower corridor; within 0.45 m of the goal from step 15 on.
     path = straight((AIM[0] + 2.0, AIM[1]), (AIM[0] - 1.0, AIM[1]), 30)
-    before, after = (TASK.abstraction(path.columns[name]) for name in (STATE, NEXT_STATE))
+    before, after = (TASK.abstraction(path.columns[name]) for name in (keys.STATE, keys.NEXT_STATE))
     toppled = np.arange(30) == toppled_at
     judged = outcomes(TASK.objective, before, after, AIM, toppled)
     assert {len(values) for values in judged.values()} == {length}
@@ -106,16 +95,16 @@ def test_an_episode_ends_at_the_goal_or_where_it_topples(toppled_at: int | None,
 
 def test_each_copy_has_a_goal_of_its_own_among_those_of_the_task() -> None:
     path = straight((-4.0, 4.0), (-3.9, 4.0), 20)
-    columns = {**path.columns, GOAL: np.tile(AIM, (20, 1)), TERMINATED: np.zeros(20, bool)}
-    episode = Episode(0, columns | {SUCCESS: np.zeros(20, bool)})
-    moving, rng = [TASK.state, replace(TASK.state, name=NEXT_STATE), TASK.action], np.random.default_rng(0)
+    columns = {**path.columns, keys.GOAL: np.tile(AIM, (20, 1)), keys.TERMINATED: np.zeros(20, bool)}
+    episode = keys.Episode(0, columns | {keys.SUCCESS: np.zeros(20, bool)})
+    moving, rng = [TASK.state, replace(TASK.state, name=keys.NEXT_STATE), TASK.action], np.random.default_rng(0)
     copies = [relocation().copied(episode, moving, rng) for _ in range(12)]
-    goals = np.array([copy[0][GOAL] for copy in copies if copy is not None])
+    goals = np.array([copy[0][keys.GOAL] for copy in copies if copy is not None])
     assert len(goals) == 12 and (goals == goals[:, :1]).all() and len(np.unique(goals[:, 0], axis=0)) == 12
     assert 0.0 < np.abs(goals - AIM).max() <= 0.6 + 1e-6
 
 
-def kick(steps: int, ball_m: float, *, ends: bool = False) -> Episode:
+def kick(steps: int, ball_m: float, *, ends: bool = False) -> keys.Episode:
     """Return an episode of a robot that stands at the origin, and whose ball rolls on by `ball_m` a step."""
     state = np.zeros((steps + 1, KICKING.state.size), np.float32)
     state[:, 2] = 1.0
@@ -123,19 +112,19 @@ def kick(steps: int, ball_m: float, *, ends: bool = False) -> Episode:
     state[1:, -3] = ball_m / KICKING.timestep_s
     last = np.arange(steps) == steps - 1
     columns = {
-        STATE: state[:-1].copy(),
-        NEXT_STATE: state[1:].copy(),
-        ACTION: np.tile(np.array([0.3, 0.0, 1.0], np.float32), (steps, 1)),
-        GOAL: np.tile(np.array([1.5, 0.0], np.float32), (steps, 1)),
-        TERMINATED: last & ends,
-        SUCCESS: np.zeros(steps, dtype=bool),
+        keys.STATE: state[:-1].copy(),
+        keys.NEXT_STATE: state[1:].copy(),
+        keys.ACTION: np.tile(np.array([0.3, 0.0, 1.0], np.float32), (steps, 1)),
+        keys.GOAL: np.tile(np.array([1.5, 0.0], np.float32), (steps, 1)),
+        keys.TERMINATED: last & ends,
+        keys.SUCCESS: np.zeros(steps, dtype=bool),
     }
-    return Episode(7, columns, {})
+    return keys.Episode(7, columns, {})
 
 
-def kicks(count: int, episode: Episode) -> list[dict[str, Array]]:
+def kicks(count: int, episode: keys.Episode) -> list[dict[str, keys.Array]]:
     place, rng = replace(relocation(margin_m=0.3, rotations="any"), task=KICKING), np.random.default_rng(0)
-    moving = [KICKING.state, replace(KICKING.state, name=NEXT_STATE), KICKING.action]
+    moving = [KICKING.state, replace(KICKING.state, name=keys.NEXT_STATE), KICKING.action]
     copied = [place.copied(episode, moving, rng) for _ in range(count)]
     return [copy[0] for copy in copied if copy is not None]
 
@@ -145,12 +134,12 @@ def test_a_ball_moves_with_its_robot() -> None:
     assert len(made) == 100
     turns = set()
     for columns in made:
-        start, end = (KICKING.abstraction(columns[name]) for name in (STATE, NEXT_STATE))
-        apart, heading = start[:, 4:6] - start[:, :2], columns[STATE][:, 2:4]
+        start, end = (KICKING.abstraction(columns[name]) for name in (keys.STATE, keys.NEXT_STATE))
+        apart, heading = start[:, 4:6] - start[:, :2], columns[keys.STATE][:, 2:4]
         distance = 0.2 + 0.1 * np.arange(len(start))
         np.testing.assert_allclose(apart, distance[:, None] * heading, atol=1e-5)
-        np.testing.assert_allclose(columns[ACTION][:, :2], 0.3 * heading, atol=1e-6)
-        assert (columns[ACTION][:, 2] == 1.0).all()
+        np.testing.assert_allclose(columns[keys.ACTION][:, :2], 0.3 * heading, atol=1e-6)
+        assert (columns[keys.ACTION][:, 2] == 1.0).all()
         np.testing.assert_allclose(end[1:, 6:], 0.1 / KICKING.timestep_s * heading[1:], atol=1e-5)
         turns.add(round(float(np.arctan2(heading[0, 1], heading[0, 0])), 2))
     assert len(turns) > 80
@@ -159,24 +148,24 @@ def test_a_ball_moves_with_its_robot() -> None:
 def test_a_ball_begins_on_the_field_and_ends_the_copy_where_it_leaves_it() -> None:
     ends = {"goal": 0, "out": 0, "field": 0}
     for columns in kicks(300, kick(12, 0.1)):
-        x, y = KICKING.abstraction(columns[STATE])[0, 4:6]
+        x, y = KICKING.abstraction(columns[keys.STATE])[0, 4:6]
         assert -2.0 <= x < 1.5 and abs(y) <= 2.0
-        end = KICKING.abstraction(columns[NEXT_STATE])
+        end = KICKING.abstraction(columns[keys.NEXT_STATE])
         x, y = end[-1, 4:6]
         is_out = x >= 1.5 or x < -2 or abs(y) > 2
         how = "goal" if x >= 1.5 and abs(y) <= 0.75 else "out" if is_out else "field"
         ends[how] += 1
         before = [False] * (len(end) - 1)
-        assert columns[SUCCESS].tolist() == [*before, how == "goal"]
-        assert columns[TERMINATED].tolist() == [*before, how != "field"]
-        assert columns[TRUNCATED].tolist() == [*before, how == "field"]
+        assert columns[keys.SUCCESS].tolist() == [*before, how == "goal"]
+        assert columns[keys.TERMINATED].tolist() == [*before, how != "field"]
+        assert columns[keys.TRUNCATED].tolist() == [*before, how == "field"]
         assert len(end) == 12 or how != "field"
         # All but the end is paid by the meters that ball and robot come closer, less than 0.15 a step.
-        assert columns[REWARD][-1] == pytest.approx({"goal": 10, "out": -10, "field": 0}[how], abs=0.2)
+        assert columns[keys.REWARD][-1] == pytest.approx({"goal": 10, "out": -10, "field": 0}[how], abs=0.2)
     assert min(ends.values()) > 10
 
 
 def test_what_ended_an_episode_with_a_ball_is_not_copied() -> None:
     made = kicks(50, kick(12, 0.0, ends=True))
-    assert {len(columns[TERMINATED]) for columns in made} == {11}
-    assert not any(columns[TERMINATED].any() for columns in made) and kicks(3, kick(5, 0.0, ends=True)) == []
+    assert {len(columns[keys.TERMINATED]) for columns in made} == {11}
+    assert not any(columns[keys.TERMINATED].any() for columns in made) and kicks(3, kick(5, 0.0, ends=True)) == []

@@ -31,7 +31,7 @@ from matplotlib.figure import Figure
 from astra_data.core.artifact import read_manifest
 from astra_data.core.durable import file_digest
 from astra_data.core.errors import BadInputError, MissingStageError
-from astra_data.core.naming import seed_folder
+from astra_data.core.naming import artifact_key
 from astra_data.pipeline.stages import report as stage
 from astra_data.pipeline.stages.report import is_current, report
 from astra_data.reports.figures import catalog as figures
@@ -205,11 +205,11 @@ def test_sizes_are_set_side_by_side(rough: None, tmp_path: Path, monkeypatch: py
     for percent in (50, 100):
         for seed in SEEDS:
             write_evaluation(root, "astra", seed, percent)
-            write_fake(root / "subset" / seed_folder(seed, percent))
+            write_fake(root / artifact_key("subset", "", seed, percent))
     for seed in SEEDS[:2]:
         write_evaluation(root, "direct_transfer", seed, 100)
     # At 50 % one seed of ASTRA is worse.
-    path = root / "evaluate/astra" / seed_folder(2, 50) / "evaluation.json"
+    path = root / artifact_key("evaluate", "astra", 2, 50) / "evaluation.json"
     edit_json(path, target=outcomes([0, 0, 0, 0], 2))
     sized = FakeRecipe("sizes", methods=("direct_transfer", "astra"), percents=(10, 100, 50))
     found = make(root, tmp_path / "results", sized)

@@ -143,7 +143,7 @@ def test_the_plain_point_mass_does_these_operations_in_this_order() -> None:
     """Recorded datasets hold its float32 states: no rounding may change."""
     torch.manual_seed(1)
     simulator = PointMass(U_MAZE, 100, timestep_s=0.192, speed_m_s=0.25)
-    position = torch.tensor(U_MAZE.free_centers()[:1], dtype=torch.float32).expand(100, 2)
+    position = torch.tensor(U_MAZE.cell_center(*U_MAZE.start)).expand(100, 2)
     simulator.reset_to(torch.cat([position, torch.zeros(100, 2)], dim=-1))
     for _ in range(50):
         action = 2 * torch.randn(100, 2)
