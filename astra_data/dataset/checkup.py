@@ -2,6 +2,7 @@
 
 import math
 import re
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal, Self
@@ -276,11 +277,12 @@ def check_up(dataset: Dataset, called: str | None = None) -> Checkup:
     summary = []
     if ACTION in columns:
         found += constant(columns[ACTION], ranges[ACTION])
-        line, more = commands(columns[ACTION], as_rows(dataset.columns([ACTION])[ACTION]), dataset.starts, fps)
+        actions = (as_rows(episode.columns[ACTION]) for episode in dataset.episodes([ACTION]))
+        line, more = commands(columns[ACTION], actions, ranges[ACTION], fps)
         summary, found = [f"commands: {line}"], found + more
     ended = None
     if TERMINATED in columns:
-        ended = dataset.columns([TERMINATED])[TERMINATED][dataset.starts + dataset.lengths - 1]
+        ended = np.array([episode.columns[TERMINATED][-1] for episode in dataset.episodes([TERMINATED])])
     line, more = endings(uids, dataset.lengths, ended, dataset.successes())
     found = sorted(found + more, key=lambda finding: finding.severity != "warning")
     rates = [str(clock) for clock in clocks] or [f"{fps} Hz declared; no time column to compare it with"]
@@ -288,18 +290,25 @@ def check_up(dataset: Dataset, called: str | None = None) -> Checkup:
     return Checkup(dataset.reference, tuple(summary), tuple(found))
 
 
-def edge_shares(actions: Array) -> Floats:
-    """Return the share of steps at the edge of the range, of each command (A,); 0 where it is a choice of few."""
-    shares = ((actions == actions.min(axis=0)) | (actions == actions.max(axis=0))).mean(axis=0)
-    return np.where([len(np.unique(values)) > DISCRETE for values in actions.T], shares, 0.0)
+def commands(column: Column, episodes: Iterable[Array], extremes: Floats, fps: int) -> tuple[str, list[Finding]]:
+    """Say how long the commands (T, A) of episodes are held, how often at an edge of their range, and where too often.
 
-
-def commands(column: Column, actions: Array, starts: Ints, fps: int) -> tuple[str, list[Finding]]:
-    """Say how long commands (N, A) of episodes from rows `starts` (E,) are held, how often at an edge, too often."""
-    names, shares = labels(column), edge_shares(actions)
-    held = np.sort(np.concatenate([held_steps(part) for part in np.split(actions, starts[1:])]))
-    count = np.arange(1, len(held) + 1)
-    median_s, long_s = (float(held[np.searchsorted(count, share * len(held))] / fps) for share in (0.5, 0.95))
+    `extremes` (2, A) are the smallest and the largest of all; a choice among few commands has no edge.
+    """
+    names, held, steps = labels(column), Counter[int](), 0
+    at_edge, known = np.zeros(column.size, np.int64), list[Array]([np.zeros(0)] * column.size)
+    for actions in episodes:
+        held.update(held_steps(actions).tolist())
+        at_edge += ((actions == extremes[0]) | (actions == extremes[1])).sum(axis=0)
+        known = [
+            few if len(few) > DISCRETE else np.union1d(few, values)
+            for few, values in zip(known, actions.T, strict=True)
+        ]
+        steps += len(actions)
+    shares = np.where([len(values) > DISCRETE for values in known], at_edge / steps, 0.0)
+    durations = np.array(sorted(held)) / fps
+    count = np.cumsum([held[length] for length in sorted(held)])
+    median_s, long_s = (float(durations[np.searchsorted(count, share * count[-1])]) for share in (0.5, 0.95))
     most = np.sort(np.argsort(-shares, kind="stable")[:SHOWN])
     edges = ", ".join(f"{names[index]} {100 * shares[index]:.1f} %" for index in most)
     edges += f" and {len(names) - SHOWN} less often" if len(names) > SHOWN else ""

@@ -78,28 +78,25 @@ class Inspection:
 
 
 def inspect_dataset(dataset: Dataset) -> Inspection:
-    """Summarize `dataset`, reading it once, one episode at a time."""
+    """Summarize `dataset`; memory stays bounded."""
     ranges, successes = dataset.statistics(), dataset.successes()
     spreads = []
     for column in dataset.schema:
         low, high, mean = (np.array(ranges[column.name][key], np.float64) for key in ("min", "max", "mean"))
         spreads.append(Spread(column, low, high, mean, np.zeros((column.size, BINS), np.int64)))
     positions, velocities = (_empty_map(dataset, role) for role in ("position", "vector"))
-    endings = Endings() if TERMINATED in dataset.features else None
-    for episode in dataset.episodes():
-        if endings is not None:
-            endings.add(episode.columns)
+    for block in dataset.blocks([column.name for column in dataset.schema]):
         for spread in spreads:
-            _count(spread, episode.columns[spread.column.name])
+            _count(spread, block[spread.column.name])
         for planar, group in filter(None, (positions, velocities)):
-            _visit(planar, episode.columns[STATE][:, group])
+            _visit(planar, block[STATE][:, group])
     return Inspection(
         reference=dataset.reference,
         fps=int(dataset.info["fps"]),
         lengths=dataset.lengths,
         cameras={name: camera.feature["shape"] for name, camera in dataset.cameras.items()},
         success=None if successes is None else sum(value is True for value in successes),
-        endings=endings,
+        endings=endings_of(dataset) if TERMINATED in dataset.features else None,
         spreads=tuple(spreads),
         positions=positions and positions[0],
         velocities=velocities and velocities[0],

@@ -16,7 +16,6 @@ from astra_data.dataset.checkup import (
     check_up,
     commands,
     continuity,
-    edge_shares,
     endings,
     held_steps,
     is_angle,
@@ -255,14 +254,17 @@ def test_commands_are_held_as_long_as_all_of_them_stay() -> None:
 
 def test_steps_at_either_edge_of_the_range_are_counted() -> None:
     linear = [np.linspace(-0.5, 0.5, 10), np.linspace(-0.8, 0.8, 8)]
-    actions = np.concatenate([*linear, [-1, 1], [1.0] * 5 + [-1.0] * 2 + [0.0] * 3])
-    np.testing.assert_allclose(edge_shares(actions[:, None]), [9 / 30])
+    episodes = [*linear, np.array([-1.0, 1.0]), np.array([1.0] * 5 + [-1.0] * 2 + [0.0] * 3)]
+    actions = [part[:, None] for part in episodes]
+    line, found = commands(Column(ACTION), actions, np.array([[-1.0], [1.0]]), 10)
+    assert line == "held 0.1 s (median), 0.5 s (95 %); steps at the edge of the range: action 30.0 %"
+    assert "in up to 30 % of steps, action" in found[0].what
 
 
 @pytest.mark.parametrize(("values", "found"), [(8, False), (9, True)])
 def test_a_choice_of_a_few_commands_has_no_edge(values: int, found: bool) -> None:
-    action = np.tile(np.arange(values), 10)
-    assert bool(commands(Column(ACTION), action[:, None], np.array([0, 40]), 10)[1]) == found
+    actions = np.array_split(np.tile(np.arange(values), 10)[:, None], 2)
+    assert bool(commands(Column(ACTION), actions, np.array([[0], [values - 1]]), 10)[1]) == found
 
 
 def test_the_longest_rest_is_counted_in_each_column() -> None:

@@ -63,7 +63,8 @@ def test_how_it_was_made_is_told_beside_the_content_hash_only(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize(
-    ("group_rows", "lengths"), [(1, LENGTHS), (7, LENGTHS), (8, (8, 12, 30, 5)), (20, (20, 30, 5)), (2**12, (55,))]
+    ("group_rows", "lengths"),
+    [(1, LENGTHS), (7, LENGTHS), (8, (8, 12, 30, 5)), (20, (20, 30, 5)), (40, (20, 35)), (2**12, (55,))],
 )
 def test_small_episodes_share_a_row_group(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, group_rows: int, lengths: tuple[int, ...]
