@@ -143,13 +143,11 @@ class Column:
 
     def faults(self, values: Array) -> list[str]:
         """List how the dtype and shape of `values` differ from the column's; empty if they fit."""
-        expected = "(T,)" if self.size == 1 else f"(T, {self.size})"
-        checks = {
-            f"{self.name}: dtype {values.dtype}, expected {self.dtype}": values.dtype == self.dtype,
-            f"{self.name}: shape {values.shape}, expected {expected}": values.shape[1:]
-            == (self.size,)[self.size == 1 :],
-        }
-        return unmet(checks)
+        wrong = [] if values.dtype == self.dtype else [f"{self.name}: dtype {values.dtype}, expected {self.dtype}"]
+        if values.shape[1:] != (self.size,)[self.size == 1 :]:
+            expected = "(T,)" if self.size == 1 else f"(T, {self.size})"
+            wrong.append(f"{self.name}: shape {values.shape}, expected {expected}")
+        return wrong
 
 
 OUTCOME_COLUMNS = (

@@ -19,7 +19,7 @@ from astra_data.core.provenance import origin
 from astra_data.dataset import format as layout
 from astra_data.dataset.columns import Array
 from astra_data.dataset.format import DATASET_PATH, DIGESTS_PATH
-from astra_data.dataset.parquet import to_numpy
+from astra_data.dataset.parquet import to_arrow, to_numpy
 from astra_data.dataset.plain import episodes_files, read_object, read_small_table
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
@@ -94,8 +94,9 @@ class ContentHash:
 
     def update(self, name: str, values: Array) -> None:
         """Append `values` (n,) or (n, size), contiguous, to column `name`."""
-        self._kinds.setdefault(name, f"{values.dtype.name}{values.shape[1:]}")
-        self._columns.setdefault(name, hashlib.sha256()).update(values.data)
+        if name not in self._columns:
+            self._columns[name], self._kinds[name] = hashlib.sha256(), f"{values.dtype.name}{values.shape[1:]}"
+        self._columns[name].update(values.data)
 
     def hexdigest(self) -> str:
         """Return the hash of all values so far."""
@@ -151,7 +152,7 @@ def alteration(columns: Sequence[str], path: Path, row: int, steps: int, episode
 
 def write_digests(root: Path, digests: Mapping[str, ArrayLike]) -> None:
     """Write meta/astra/digests.parquet, plain: random bits neither compress nor repeat."""
-    table = pa.table({name: pa.array(np.asarray(values, np.uint64)) for name, values in digests.items()})
+    table = pa.table({name: to_arrow(np.asarray(values, np.uint64)) for name, values in digests.items()})
     pq.write_table(table, root / DIGESTS_PATH, compression="none", use_dictionary=False, write_statistics=False)
 
 

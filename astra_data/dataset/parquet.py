@@ -20,17 +20,19 @@ BLOCK_ROWS = 2**16  # rows read at once, rounded up to whole row groups
 BLOCK_VALUES = 2**23  # values of arrays that are read at once, where that is fewer rows; rounded up, too
 
 
-def to_arrow(values: Array, kind: pa.DataType) -> pa.Array:
-    """Return `values` (T,) or (T, size) as an Arrow array of type `kind`; only bools are copied."""
-    if values.ndim == 1:
-        return pa.array(values, kind)
-    return pa.FixedSizeListArray.from_arrays(pa.array(values.reshape(-1), kind.value_type), values.shape[1])
+def to_arrow(values: Array) -> pa.Array:
+    """Return `values` (T,) or (T, size) as an Arrow array of their type; only bools are copied."""
+    if values.ndim > 1:
+        return pa.FixedSizeListArray.from_arrays(to_arrow(values.reshape(-1)), values.shape[1])
+    # As buffers, because Arrow's own conversion imports pandas.
+    data = np.packbits(values, bitorder="little") if values.dtype == bool else np.ascontiguousarray(values)
+    return pa.Array.from_buffers(pa.from_numpy_dtype(values.dtype), len(values), [None, pa.py_buffer(data)])
 
 
 def to_lists(values: Array) -> pa.ListArray:
     """Return the rows of `values` (n, size) as n lists."""
     offsets = np.arange(len(values) + 1, dtype=np.int32) * np.int32(values.shape[1])
-    return pa.ListArray.from_arrays(offsets, np.ascontiguousarray(values).reshape(-1))
+    return pa.ListArray.from_arrays(to_arrow(offsets), to_arrow(values.reshape(-1)))
 
 
 def to_numpy(column: pa.ChunkedArray, size: int, dtype: str) -> Array:
@@ -80,7 +82,7 @@ def read_blocks(
                         masks += [] if wanted is None else [wanted[begin:end]]
                     if groups and (rows >= enough or group == metadata.num_row_groups - 1):
                         table = file.read_row_groups(groups, columns=names, use_threads=False)
-                        yield table if all(mask.all() for mask in masks) else table.filter(np.hstack(masks))
+                        yield table if all(mask.all() for mask in masks) else table.filter(to_arrow(np.hstack(masks)))
                         groups, masks, rows = [], [], 0
         except UNREADABLE as error:
             name = f"{path.parent.name}/{path.name}"

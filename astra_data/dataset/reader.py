@@ -311,10 +311,11 @@ def _parsed(root: Path, description: dict[str, Any]) -> dict[str, Any]:
     metadata = pa.concat_tables(read_blocks([root / layout.METADATA_PATH])).to_pydict()
     del metadata["length"]
     uids = metadata.pop("episode_uid")
-    rows: dict[Path, int] = {}
-    for chunk, file, length in zip(chunks.tolist(), files.tolist(), lengths.tolist(), strict=True):
-        path = root / info["data_path"].format(chunk_index=chunk, file_index=file)
-        rows[path] = rows.get(path, 0) + length
+    places, place = np.unique(np.column_stack([chunks, files]), axis=0, return_inverse=True)
+    rows = {
+        root / info["data_path"].format(chunk_index=chunk, file_index=file): int(count)
+        for (chunk, file), count in zip(places.tolist(), np.bincount(place.ravel(), lengths), strict=True)
+    }
     faults = [f"{name}: {fault}" for name, fault in faults_of.items()]
     faults += [
         f"{path.relative_to(root)} does not belong to it" for path in sorted({*plain.data_files(root)} - {*rows})

@@ -18,7 +18,7 @@ from astra_data.dataset.format import (
     STORED_STATISTICS,
     episodes_schema,
 )
-from astra_data.dataset.parquet import RotatingWriter, read_arrays, to_lists
+from astra_data.dataset.parquet import RotatingWriter, read_arrays, to_arrow, to_lists
 from astra_data.dataset.plain import PlainColumn
 
 BLOCK_BYTES = 192 * 2**20  # of values held in memory at once, unless those of one index are more
@@ -138,7 +138,7 @@ class EpisodeRows:
         ends = self._frames + np.cumsum(lengths)
         episodes = np.arange(self._episodes, self._episodes + count)
         rows: list[Array] = [lengths, chunks, files, ends - lengths, ends]
-        arrays = [pa.array(episodes), pa.array([[self._task]] * count), *map(pa.array, rows)]
+        arrays = [to_arrow(episodes), pa.array([[self._task]] * count), *map(to_arrow, rows)]
         stacked = np.stack(self._statistics)
         for column, part in side_by_side(self._columns):
             if column.dtype == "float32":  # more digits would take more room than the values of short episodes
@@ -149,7 +149,7 @@ class EpisodeRows:
         for field in self._schema.names[len(arrays) : -2]:
             known = (one.get(field) for one in self.pictures[self._episodes : self._episodes + count])
             arrays.append(pa.array(known, self._schema.field(field).type))
-        arrays += [pa.array(np.full(count, chunk)), pa.array(np.full(count, file))]
+        arrays += [to_arrow(np.full(count, chunk)), to_arrow(np.full(count, file))]
         self._writer.write(pa.Table.from_arrays(arrays, schema=self._schema))
         self._episodes += count
         self._frames = int(ends[-1])

@@ -197,7 +197,7 @@ class DatasetWriter:
             arrays = [
                 self._group[0][field.name]
                 if field.type == layout.IMAGE
-                else to_arrow(np.concatenate([one[field.name] for one in self._group]), field.type)
+                else to_arrow(np.concatenate([one[field.name] for one in self._group]))
                 for field in self._schema
             ]
             self._data.write(pa.Table.from_arrays(arrays, schema=self._schema))
@@ -504,7 +504,7 @@ def write_staged(path: Path, episode: Episode, schema: pa.Schema) -> None:
         "metadata": dict(episode.metadata),
         "digests": {name: described.digest_of(episode.columns[name]) for name in schema.names},
     }
-    arrays = [to_arrow(episode.columns[field.name], field.type) for field in schema]
+    arrays = [to_arrow(episode.columns[name]) for name in schema.names]
     schema = schema.with_metadata({"episode": json.dumps(facts)})
     with path.open("wb") as sink, pa.ipc.new_file(sink, schema) as file:
         file.write_table(pa.Table.from_arrays(arrays, schema=schema))

@@ -22,7 +22,7 @@ from astra_data.dataset.parquet import RotatingWriter, read_blocks, to_arrow, to
     ],
 )
 def test_values_go_to_arrow_and_back(values: Array, kind: pa.DataType) -> None:
-    column = to_arrow(values, kind)
+    column = to_arrow(values)
     assert (column.type, column.to_pylist()) == (kind, values.tolist())
     chunks = pa.chunked_array([column[:1], column[1:]])
     size = values.shape[1] if values.ndim > 1 else 1

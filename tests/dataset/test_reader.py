@@ -167,7 +167,7 @@ def test_the_content_hash_sees_values_only(tmp_path: Path) -> None:
 def test_reading_needs_no_heavy_package(fake: Dataset) -> None:
     code = (
         "import sys; from pathlib import Path; from astra_data.dataset.reader import Dataset; "
-        "Dataset.open(Path(sys.argv[1])).columns(['action']); "
+        "Dataset.open(Path(sys.argv[1])).columns(['action'], episodes=[2]); "
         "print(*sys.modules)"
     )
     command = [sys.executable, "-c", code, str(fake.root)]
