@@ -55,10 +55,11 @@ def quick_fits(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def forgotten_methods() -> Iterator[None]:
     """Forget afterwards the methods of one's own that a test adds to this process."""
-    methods, policies = (
-        importlib.import_module(f"astra_data.{name}") for name in ("methods", "policies.running_policy")
+    methods, files, encoders, policies = (
+        importlib.import_module(f"astra_data.{name}")
+        for name in ("methods", "grounding.files", "grounding.encoder", "policies.learner")
     )
-    registered = (methods.METHODS, methods.KINDS, methods.ENCODERS, methods._PLACES, policies.KINDS)
+    registered = (methods.METHODS, files.kinds(), encoders.ENCODERS, methods._PLACES, policies.KINDS)
     known = [dict(found) for found in registered]
     yield
     for found, before in zip(registered, known, strict=True):

@@ -127,6 +127,6 @@ def test_a_card_with_its_figure_needs_no_more_than_its_own_extra(tmp_path: Path)
 def test_what_needs_an_extra_says_which() -> None:
     code = WITHOUT.format(names=("torch",)) + (
         "import astra_data\nfrom astra_data.core.errors import BadInputError\n"
-        "try: astra_data.pair\nexcept BadInputError as error: print(error)\n"
+        "try: astra_data.TASKS['antmaze-umaze'].simulator(1)\nexcept BadInputError as error: print(error)\n"
     )
     assert "uv sync --extra sim" in python(code) and issubclass(BadInputError, Exception)

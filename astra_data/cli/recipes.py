@@ -1,5 +1,6 @@
 """Commands on recipes and runs, of stages alone, and what to begin with."""
 
+import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -315,10 +316,8 @@ def collect(
         return
     seed = arguments.refuse_of_recipes("collect", seeds, jobs) or 0
     arguments.task_at(task)
-    import torch
-
-    # The networks' idle threads would slow down the physics.
-    torch.set_num_threads(1)
+    # Torch's idle threads would slow down the physics; it is not loaded yet.
+    os.environ["OMP_NUM_THREADS"] = "1"
     with arguments.resumable("run the same command with --resume to continue"):
         _make("collect", task, settings, seed=seed, out=out, name=name, resume=resume)
 

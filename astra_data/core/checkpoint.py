@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
-from torch import Tensor, nn
 
 from astra_data.core.artifact import check_intact
 from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError
+from astra_data.core.lazy import Tensor, torch
 from astra_data.core.naming import first_few
 from astra_data.core.progress import Stopwatch
 
@@ -24,6 +23,8 @@ CHECKPOINT_SECONDS = 60.0
 
 def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]) -> None:
     """Write `tensors` and `metadata` (JSON values) to `path`; an existing file is replaced atomically."""
+    from safetensors.torch import save  # noqa: PLC0415 - it loads torch
+
     if not tensors:
         raise BadInputError(f"{path}: expected at least one tensor to save")
     # safetensors refuses tensors that share memory, such as tied weights or views.
@@ -113,7 +114,7 @@ def part_of(tensors: Mapping[str, Tensor], part: str) -> dict[str, Tensor]:
     return {name.removeprefix(prefix): one for name, one in tensors.items() if name.startswith(prefix)}
 
 
-def loaded[Module: nn.Module](model: Module, weights: Mapping[str, Tensor], device: str = "cpu") -> Module:
+def loaded[Module: torch.nn.Module](model: Module, weights: Mapping[str, Tensor], device: str = "cpu") -> Module:
     """Return `model` with these weights, on `device`, frozen and out of training."""
     model.load_state_dict(weights)
     return model.to(device).requires_grad_(False).eval()
@@ -122,7 +123,7 @@ def loaded[Module: nn.Module](model: Module, weights: Mapping[str, Tensor], devi
 def _to_json(value: Nested, tensors: dict[str, Tensor]) -> Any:  # noqa: ANN401 - a JSON value
     """Add the tensors of a training state to `tensors`; return all else as a JSON value."""
     match value:
-        case Tensor():
+        case torch.Tensor():
             name = str(len(tensors))
             tensors[name] = value
             return {"tensor": name}

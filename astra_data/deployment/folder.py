@@ -11,7 +11,6 @@ from astra_data.core.durable import atomic_folder, file_digest, refuse_existing
 from astra_data.core.errors import BadInputError
 from astra_data.core.provenance import origin
 from astra_data.dataset.columns import ACTION, GOAL, STATE, Column
-from astra_data.deployment.graph import INPUTS, ONNX, OUTPUTS, write_graph
 from astra_data.pipeline.trained_policy import trained_policy
 from astra_data.policies.running_policy import RunningPolicy
 from astra_data.reports.blocks import table
@@ -56,6 +55,8 @@ def deploy(run: Path, row: str, out: Path, *, seed: int = 0, percent: int | None
             f"{row} acts on {', '.join(deployed.sensing.inputs)} in place of states, which a folder does not: act with "
             "astra_data.load_policy, or align without inputs"
         )
+    from astra_data.deployment.graph import write_graph
+
     digests = {stage: file_digest(path) for stage, path in trained.files.items()}
     with atomic_folder(out) as folder:
         parts, apart = write_graph(deployed, folder)
@@ -79,6 +80,8 @@ def describe(
     deployed: RunningPolicy, parts: Mapping[str, int], recorded: tuple[Sequence[float], Sequence[float]] | None = None
 ) -> dict[str, Any]:
     """Return what running a policy takes: `parts` of its hidden state, least and largest `recorded` states, names."""
+    from astra_data.deployment.graph import INPUTS, ONNX, OUTPUTS
+
     task = deployed.task
     encoders = {"target": deployed.target_encoder, "source": deployed.source_encoder}
     least, largest = zip(*task.limits.values(), strict=True)

@@ -11,7 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from astra_data.core.errors import BadInputError, optional
-from astra_data.policies.running_policy import Memory, RunningPolicy, UserPolicy
+from astra_data.policies.networks import UserPolicy
+from astra_data.policies.running_policy import Memory, RunningPolicy
 
 _DECOMPOSED: dict[Any, Callable[..., Any]] = {
     torch.ops.aten.hypot.default: lambda x, y: (x.square() + y.square()).sqrt()

@@ -7,15 +7,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import torch
-from torch import Tensor, nn
-
 from astra_data.core.checkpoint import Logbook
 from astra_data.core.config import AtOnce, Config, Count, Positive
 from astra_data.core.errors import BadInputError
+from astra_data.core.lazy import Tensor, torch
 
 
-def seed_generators(seed: int, device: torch.device) -> None:
+def seed_generators(seed: int, device: "torch.device") -> None:
     """Seed torch's generators of the CPU and `device`; `torch.manual_seed` takes ten times as long."""
     torch.default_generator.manual_seed(seed)
     if device.type == "cuda":
@@ -24,7 +22,7 @@ def seed_generators(seed: int, device: torch.device) -> None:
 
 
 @contextmanager
-def seeded(seed: int, device: torch.device) -> Iterator[None]:
+def seeded(seed: int, device: "torch.device") -> Iterator[None]:
     """Draw on the CPU and `device` from `seed` in the block; afterwards, draws go on as before it."""
     with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
         seed_generators(seed, device)
@@ -76,7 +74,12 @@ class Descent:
     """A fit by AdamW, after `done` updates; `points` are measurements, `stopwatch` counts earlier sessions too."""
 
     def __init__(
-        self, model: nn.Module, config: DescentConfig, *, checkpoint: Path | None = None, weight_decay: float = 0.0
+        self,
+        model: "torch.nn.Module",
+        config: DescentConfig,
+        *,
+        checkpoint: Path | None = None,
+        weight_decay: float = 0.0,
     ) -> None:
         """Start to fit the parameters of `model` that require gradients, or resume from `checkpoint` if it exists."""
         self.done = 0

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from astra_data.core.arrays import Bools, Floats, Ints, as_rows
 from astra_data.core.errors import BadInputError
+from astra_data.core.lazy import torch
 from astra_data.core.progress import Progress, silent
 from astra_data.dataset import columns as keys
 from astra_data.dataset.checkup import Finding

@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from itertools import pairwise
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -215,16 +215,6 @@ def _open(gates: Tensor, given: Tensor, draft: Tensor) -> Tensor:
 
 ENCODERS: dict[str, type[Encoder]] = {HistoryEncoder.kind: HistoryEncoder}
 """The encoders that can be read, by what files call them; methods of the user's add theirs."""
-
-
-class LatentEncoder(Protocol):
-    """A network with a history encoder: the source encoder ψ^s, or the target encoder ψ^t."""
-
-    encoder: Encoder
-
-    def encoder_input(self, state: Tensor, goal: Tensor, previous_action: Tensor) -> Tensor:
-        """Assemble the encoder's input (..., I) of states, goals and the actions that led there."""
-        ...
 
 
 def take_scales(network: nn.Module, values: Mapping[str, Tensor]) -> None:

@@ -17,7 +17,7 @@ from astra_data.core.seeding import derive
 from astra_data.grounding.descent import Descent, DescentConfig, seeded
 from astra_data.grounding.encoder import Members, take_scales
 from astra_data.grounding.open_loop import Moments
-from astra_data.grounding.paired_episodes import RISK_STEPS, PairedEpisodes, PairedWindows, before_failures
+from astra_data.grounding.paired_episodes import BINS, RISK_STEPS, PairedEpisodes, PairedWindows, before_failures
 from astra_data.grounding.simulator import Grounding
 from astra_data.worlds.task import Task
 
@@ -36,7 +36,6 @@ _BATCH = 512
 _FAILING_SHARE = 0.25  # of each batch: steps that fail soon are too rare to be drawn as often as they come
 _WEIGHT_DECAY = 1.0
 _DESCENT = DescentConfig(updates=200, learning_rate=3e-3)
-BINS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # edges of the probabilities in a reliability diagram
 
 
 @dataclass(frozen=True)

@@ -7,12 +7,11 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch.nn import functional
 
 from astra_data.core.arrays import as_column
 from astra_data.core.errors import BadInputError
+from astra_data.core.lazy import torch, without_gradients
 from astra_data.core.progress import Progress, silent
 from astra_data.core.seeding import generator
 from astra_data.dataset.cameras import pictures_of
@@ -51,14 +50,16 @@ class ColorPlaces:
         colors = generator(0, "colors").normal(size=(self.size // 2, 3, 1, 1))
         bell = np.exp(-(np.arange(-2, 3) ** 2) / (2 * _BLUR_PIXELS**2))
         smooth = np.outer(bell, bell) / bell.sum() ** 2
-        self._weights = torch.tensor(colors / np.linalg.norm(colors, axis=1, keepdims=True) * smooth).float()
+        weights = colors / np.linalg.norm(colors, axis=1, keepdims=True) * smooth
+        self._weights = weights.astype(np.float32)
 
-    @torch.no_grad()
+    @without_gradients
     def __call__(self, pictures: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Return the features (B, 64) of pictures (B, H, W, 3): how far right, and down, each color is, within ±1."""
         shown = torch.from_numpy(pictures).permute(0, 3, 1, 2).float() / 255.0
-        shown = functional.avg_pool2d(shown, max(1, min(shown.shape[2:]) // _PIXELS))
-        maps = functional.conv2d(functional.pad(shown, (2, 2, 2, 2), mode="replicate"), self._weights)
+        shown = torch.nn.functional.avg_pool2d(shown, max(1, min(shown.shape[2:]) // _PIXELS))
+        shown = torch.nn.functional.pad(shown, (2, 2, 2, 2), mode="replicate")
+        maps = torch.nn.functional.conv2d(shown, torch.from_numpy(self._weights))
         flat = maps.flatten(2) - maps.mean((2, 3)).unsqueeze(-1)
         shares = (_SHARPNESS * flat / (flat.amax(-1, keepdim=True) + 1e-3)).softmax(-1).view_as(maps)
         down, right = (torch.linspace(-1.0, 1.0, count) for count in maps.shape[2:])

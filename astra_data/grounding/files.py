@@ -1,27 +1,35 @@
 """Groundings and target encoders on disk: safetensors files with metadata."""
 
 import json
+from functools import cache
 from pathlib import Path
-from typing import Any, cast
-
-import torch
+from typing import TYPE_CHECKING, Any, cast
 
 from astra_data.core.checkpoint import loaded, save_tensors, understood
 from astra_data.core.errors import BadInputError
-from astra_data.grounding.alignment import TargetEncoder
-from astra_data.grounding.history import HistoryGrounding
-from astra_data.grounding.model import GroundingModel
+from astra_data.core.lazy import torch, without_gradients
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.simulator import NO_GROUNDING, FittedGrounding, Grounding
 from astra_data.worlds.task import Task
 from astra_data.worlds.user_code import explained, parts_of, restored
 
-KINDS: dict[str, type[FittedGrounding]] = {HistoryGrounding.kind: HistoryGrounding}  # by what files call them
+if TYPE_CHECKING:
+    from astra_data.grounding.alignment import TargetEncoder
+    from astra_data.grounding.history import HistoryGrounding
+    from astra_data.grounding.model import GroundingModel
 
 GROUNDING, TARGET_ENCODER = "grounding.safetensors", "target_encoder.safetensors"  # files of their artifacts
 _TARGET_ENCODER = "target encoder"
 _WRITTEN = ("kind", "to_file", "from_file")  # the parts that a grounding does not inherit
 _ROUNDING = 1e-6  # between states that are the same, relative to their size and absolute
+
+
+@cache
+def kinds() -> dict[str, type[FittedGrounding]]:
+    """Return the groundings that can be read, by what their files call them; methods of the user's add theirs."""
+    from astra_data.grounding.history import HistoryGrounding
+
+    return {HistoryGrounding.kind: HistoryGrounding}
 
 
 def save_grounding(path: Path, grounding: FittedGrounding, episodes: PairedEpisodes) -> None:
@@ -32,8 +40,8 @@ def save_grounding(path: Path, grounding: FittedGrounding, episodes: PairedEpiso
 
 def load_grounding(path: Path | str, device: str = "cpu") -> FittedGrounding:
     """Read a grounding; the parameters of its networks are frozen."""
-    with understood(Path(path), "a grounding", KINDS, device) as (tensors, metadata):
-        return restored(KINDS[metadata["kind"]], tensors, metadata, device)
+    with understood(Path(path), "a grounding", kinds(), device) as (tensors, metadata):
+        return restored(kinds()[metadata["kind"]], tensors, metadata, device)
 
 
 def grounding_at(path: Path | None, device: str = "cpu") -> Grounding:
@@ -41,21 +49,23 @@ def grounding_at(path: Path | None, device: str = "cpu") -> Grounding:
     return load_grounding(path, device) if path else NO_GROUNDING
 
 
-def load_history_model(path: Path | str, device: str = "cpu") -> GroundingModel:
+def load_history_model(path: Path | str, device: str = "cpu") -> "GroundingModel":
     """Read a grounding that has to be a history model."""
     grounding = load_grounding(path, device)
-    if grounding.kind != HistoryGrounding.kind:
+    if grounding.kind != "history":
         raise BadInputError(f"{path}: expected a history model, got a grounding without latents")
-    return cast(HistoryGrounding, grounding).model
+    return cast("HistoryGrounding", grounding).model
 
 
-def save_target_encoder(path: Path, encoder: TargetEncoder) -> None:
+def save_target_encoder(path: Path, encoder: "TargetEncoder") -> None:
     """Write `encoder` to `path`."""
     save_tensors(path, encoder.state_dict(), {"kind": _TARGET_ENCODER, "sizes": encoder.sizes})
 
 
-def load_target_encoder(path: Path | str) -> TargetEncoder:
+def load_target_encoder(path: Path | str) -> "TargetEncoder":
     """Read a target encoder; its parameters are frozen."""
+    from astra_data.grounding.alignment import TargetEncoder
+
     with understood(Path(path), "a target encoder", (_TARGET_ENCODER,), "cpu") as (tensors, metadata):
         return loaded(TargetEncoder(**metadata["sizes"]), tensors)
 
@@ -77,7 +87,7 @@ def fitted(returned: object) -> tuple[FittedGrounding, dict[str, Any]]:
         )
     grounding, figures = returned
     name = type(grounding).__name__
-    if KINDS.get(getattr(grounding, "kind", "")) is not type(grounding):
+    if kinds().get(getattr(grounding, "kind", "")) is not type(grounding):
         raise BadInputError(
             f"fit returned a {name}, which cannot be read again: expected grounding={name} of the Method"
         )
@@ -93,7 +103,7 @@ def fitted(returned: object) -> tuple[FittedGrounding, dict[str, Any]]:
     return grounding, figures
 
 
-@torch.no_grad()
+@without_gradients
 def check_step(task: Task, grounding: FittedGrounding, episodes: PairedEpisodes) -> None:
     """Step the corrected simulator of `task` once, from where the first of `episodes` begin."""
     windows = episodes.windows

@@ -3,26 +3,27 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-import torch
 from pydantic import Field
 
 from astra_data.core.artifact import CHECKPOINT
 from astra_data.core.config import AtOnce, Config, Positive
 from astra_data.core.errors import BadInputError
+from astra_data.core.lazy import torch, without_gradients
 from astra_data.core.progress import Progress
 from astra_data.core.seeding import derive
 from astra_data.dataset.columns import REWARD
 from astra_data.grounding.descent import Descent, DescentConfig, WindowedConfig
-from astra_data.grounding.encoder import Encoder, HistoryEncoder, take_scales
-from astra_data.grounding.failures import failure_figures, fit_failures, has_failures
-from astra_data.grounding.history import HistoryGrounding, fit_scatter
-from astra_data.grounding.model import GroundingModel, GroundingShape, LossWeights, recorded_rewards, telemetry
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.simulator import FittedGrounding
 from astra_data.worlds.task import Task
+
+if TYPE_CHECKING:
+    from astra_data.grounding.encoder import Encoder
+    from astra_data.grounding.history import HistoryGrounding
+    from astra_data.grounding.model import GroundingModel, LossWeights
 
 _MEASURED_EVERY = 100
 _POSITION_OCTAVES = 4
@@ -74,19 +75,24 @@ class HistoryFit:
     reward: bool  # whether the target's reward is predicted
     failures: bool = True  # whether failures are predicted by a failure model, if there are some
     scatter: bool = True  # whether the simulator scatters around the correction as the target does
-    encoder: type[Encoder] = HistoryEncoder  # the class of ψ
+    encoder: "type[Encoder] | None" = None  # the class of ψ, by default a GRU
     printed: bool = False
     """Whether R_pred learns the whole reward, failures included, as the paper prints it. By default it learns
     the residual reward: the target's less the task's own on the recorded abstract states."""
 
-    def weights(self, config: GroundConfig) -> LossWeights:
+    def weights(self, config: GroundConfig) -> "LossWeights":
         """Return the weights of the losses."""
+        from astra_data.grounding.model import LossWeights
+
         return LossWeights(
             latent=config.latent_weight if self.latent else 0.0, reward=config.reward_weight if self.reward else 0.0
         )
 
-    def __call__(self, fitting: Fitting) -> tuple[HistoryGrounding, dict[str, Any]]:
+    def __call__(self, fitting: Fitting) -> "tuple[HistoryGrounding, dict[str, Any]]":
         """Return the grounding and its figures."""
+        from astra_data.grounding.failures import failure_figures, fit_failures, has_failures
+        from astra_data.grounding.history import HistoryGrounding, fit_scatter
+
         task = fitting.task
         if self.reward and not fitting.training.has_rewards:
             raise BadInputError(
@@ -117,7 +123,10 @@ class HistoryFit:
             grounding = replace(grounding, failures=failures)
         return grounding, metrics
 
-    def _fitted(self, fitting: Fitting, *, corrects_reward: bool) -> tuple[GroundingModel, dict[str, Any]]:
+    def _fitted(self, fitting: Fitting, *, corrects_reward: bool) -> "tuple[GroundingModel, dict[str, Any]]":
+        from astra_data.grounding.encoder import HistoryEncoder, take_scales
+        from astra_data.grounding.model import GroundingModel, GroundingShape, recorded_rewards
+
         training, windows = fitting.training, fitting.training.windows
         torch.manual_seed(derive(fitting.seed, "grounding"))
         shape = GroundingShape(
@@ -128,7 +137,7 @@ class HistoryFit:
             position_octaves=_POSITION_OCTAVES if fitting.task.plane else 0,
             ball_index=fitting.task.ball_index,
             corrects_reward=corrects_reward,
-            encoder=self.encoder.kind,
+            encoder=(self.encoder or HistoryEncoder).kind,
         )
         model = GroundingModel(shape).to(fitting.device)
         correction = windows.next_state - windows.simulated_next
@@ -158,7 +167,9 @@ def with_own_rewards(task: Task, episodes: PairedEpisodes) -> PairedEpisodes:
     return replace(episodes, windows=replace(windows, own_reward=own, goes_on=goes_on, failed=failed))
 
 
-def _optimize(model: GroundingModel, weights: LossWeights, fitting: Fitting) -> dict[str, Any]:
+def _optimize(model: "GroundingModel", weights: "LossWeights", fitting: Fitting) -> dict[str, Any]:
+    from astra_data.grounding.model import telemetry
+
     config, training = fitting.config, fitting.training
     settings = fitting.descent
     descent = Descent(model, settings, checkpoint=fitting.folder / CHECKPOINT)
@@ -190,8 +201,8 @@ def _optimize(model: GroundingModel, weights: LossWeights, fitting: Fitting) -> 
     }
 
 
-@torch.no_grad()
-def _held_out_error(model: GroundingModel, episodes: PairedEpisodes, weights: LossWeights) -> float:
+@without_gradients
+def _held_out_error(model: "GroundingModel", episodes: PairedEpisodes, weights: "LossWeights") -> float:
     """Return the losses of correction and reward on whole `episodes`; latents have no scale to compare."""
     loss, _ = model.losses(episodes.windows, replace(weights, latent=0.0))
     return float(loss)

@@ -4,12 +4,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from astra_data.core.arrays import Ints
 from astra_data.core.errors import BadInputError
+from astra_data.core.lazy import Tensor, torch, without_gradients
 from astra_data.core.seeding import derive, generator
 from astra_data.grounding.paired_episodes import PairedEpisodes, PairedWindows
 from astra_data.grounding.simulator import NO_GROUNDING, EpisodeSimulator, Grounding
@@ -24,7 +23,7 @@ def distances(task: Task, error: Tensor) -> Tensor:
     return torch.stack([error[..., list(entries)].norm(dim=-1) for entries in task.quantities.values()], -1)
 
 
-@torch.no_grad()
+@without_gradients
 def gap_report(task: Task, grounding: Grounding, episodes: PairedEpisodes, *, seed: int) -> dict[str, Any]:
     """Replay recorded actions open loop in both simulators; return errors of 1 to 200 steps, with intervals."""
     torch.manual_seed(derive(seed, "gap noise"))
@@ -126,7 +125,7 @@ class Moments:
         return (self.first + count).clamp_max(self.windows.mask.shape[1] - 1)
 
 
-@torch.no_grad()
+@without_gradients
 def replay_open_loop(task: Task, grounding: Grounding, episodes: PairedEpisodes, *, seed: int) -> Tensor:
     """Replay whole `episodes` as `grounding` corrects them, without scatter; return states (E, T + 1, X)."""
     windows, device = episodes.windows, str(episodes.windows.state.device)

@@ -5,12 +5,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
-from torch.nn.utils.rnn import pad_sequence
 
 from astra_data.core.errors import BadInputError
+from astra_data.core.lazy import Tensor, torch
 from astra_data.core.seeding import held_out_episodes
 from astra_data.dataset import columns as names
 from astra_data.dataset.columns import Array
@@ -20,6 +18,7 @@ from astra_data.dataset.versions import open_dataset
 from astra_data.worlds.commands import Commands
 from astra_data.worlds.task import Task
 
+BINS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # edges of the probabilities in a reliability diagram
 RISK_STEPS = 20  # steps before each failure that `PairedWindows.fails_soon` marks
 _COLUMNS = (
     *(names.STATE, names.ACTION, names.TERMINATED),
@@ -122,7 +121,7 @@ class PairedEpisodes:
                 steps = steps.reshape(len(steps), -1)
             if name == names.ACTION and commands is not None:
                 steps = commands.normal(steps)
-            padded[name] = pad_sequence(steps.to(device).split(lengths.tolist()), batch_first=True)
+            padded[name] = torch.nn.utils.rnn.pad_sequence(steps.to(device).split(lengths.tolist()), batch_first=True)
         mask = torch.arange(lengths.max(), device=device) < torch.tensor(lengths, device=device)[:, None]
         action, terminated = padded[names.ACTION], padded[names.TERMINATED]
         reward = padded.get(names.REWARD, torch.zeros_like(terminated, dtype=action.dtype))

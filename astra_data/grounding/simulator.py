@@ -2,15 +2,26 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self
 
-from torch import Tensor
-
-from astra_data.grounding.encoder import LatentEncoder
+from astra_data.core.lazy import Tensor
 from astra_data.grounding.paired_episodes import PairedWindows
 from astra_data.worlds.protocols import PlacedSimulator, RememberingSimulator
 from astra_data.worlds.task import Task
 from astra_data.worlds.variation import Variation, VariedSimulator
+
+if TYPE_CHECKING:
+    from astra_data.grounding.encoder import Encoder
+
+
+class LatentEncoder(Protocol):
+    """A network with a history encoder: the source encoder ψ^s, or the target encoder ψ^t."""
+
+    encoder: "Encoder"
+
+    def encoder_input(self, state: Tensor, goal: Tensor, previous_action: Tensor) -> Tensor:
+        """Assemble the encoder's input (..., I) of states, goals and the actions that led there."""
+        ...
 
 
 class EpisodeSimulator:

@@ -8,13 +8,12 @@ from pathlib import Path
 from astra_data.core.config import Config, did_you_mean
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import PLUS, base_method, is_plus
-from astra_data.grounding.encoder import ENCODERS
-from astra_data.grounding.files import KINDS, missing_parts
+from astra_data.grounding.files import kinds, missing_parts
 from astra_data.grounding.fit import HistoryFit
 from astra_data.methods import astra, follower, iql
 from astra_data.methods.method import Method, Table
 from astra_data.methods.rma import RMA
-from astra_data.policies.running_policy import add_policy_kind
+from astra_data.policies.learner import add_policy_kind
 from astra_data.policies.train import InSimulator, UserLearner
 from astra_data.worlds.user_code import offered, user_object
 from astra_data.worlds.variation import Variation
@@ -63,11 +62,12 @@ def add_method(name: str, place: str) -> None:
         raise BadInputError(f"{place} is a {type(method).__name__}, expected a Method")
     if faults := [*_faults(method)]:
         raise BadInputError("; ".join(f"{place} {fault}" for fault in faults))
-    if (kind := method.grounding) and (owner := KINDS.setdefault(kind.kind, kind)) is not kind:
+    if (kind := method.grounding) and (owner := kinds().setdefault(kind.kind, kind)) is not kind:
         whose = f"{owner.__name__} in {owner.__module__}"
         raise BadInputError(f"{place}: groundings of kind '{kind.kind}' are those of {whose}: rename its kind")
-    if isinstance(method.fit, HistoryFit):
-        encoder = method.fit.encoder
+    if isinstance(method.fit, HistoryFit) and (encoder := method.fit.encoder):
+        from astra_data.grounding.encoder import ENCODERS
+
         if ENCODERS.setdefault(encoder.kind, encoder) is not encoder:
             raise BadInputError(f"{place}: there are encoders of kind '{encoder.kind}' already: rename its kind")
     if isinstance(method.learn, UserLearner):

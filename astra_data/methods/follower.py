@@ -1,9 +1,8 @@
 """Careful hand-written controllers, which show how well a task can be done (the ceiling)."""
 
 import numpy as np
-import torch
-from torch import Tensor
 
+from astra_data.core.lazy import Tensor, torch
 from astra_data.methods.method import Method
 from astra_data.policies.episodes import Act
 from astra_data.worlds.plane.mazes import Maze

@@ -6,27 +6,28 @@ The paper does not say whether the fine-tuning interacts with the target: ours l
 import copy
 import math
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
-import torch
 from pydantic import model_validator
-from torch import Tensor, nn
 
 from astra_data.core.artifact import CHECKPOINT
 from astra_data.core.checkpoint import Logbook
 from astra_data.core.config import AtOnce, Config, Count, CountFromZero, NotNegative, Positive, Share, own_settings
 from astra_data.core.errors import BadInputError
+from astra_data.core.lazy import Tensor, torch, without_gradients
 from astra_data.core.seeding import derive
 from astra_data.dataset.columns import REWARD
 from astra_data.grounding.descent import refuse_divergence, seed_generators
-from astra_data.grounding.encoder import PositionFeatures, mlp
 from astra_data.grounding.paired_episodes import PairedEpisodes, draw_steps
 from astra_data.methods.method import Method, Table
-from astra_data.policies.networks import ActorCritic, ActorCriticShape, Policy
 from astra_data.policies.running_policy import PolicyFile
 from astra_data.policies.simulator_env import policy_observation
 from astra_data.policies.train import Training
 from astra_data.worlds.task import Task
+
+if TYPE_CHECKING:
+    from astra_data.grounding.encoder import PositionFeatures
+    from astra_data.policies.networks import Policy
 
 _LARGEST_WEIGHT = 100.0
 _CRITIC_BATCH = 256  # transitions per update of the critics
@@ -104,34 +105,19 @@ class Transitions(NamedTuple):
     terminated: Tensor  # (N,) bool, the task ended there
 
 
-class _Critics(nn.Module):
-    """V, two Q, and slow copies of these, of observations (..., O) and actions (..., A)."""
-
-    def __init__(self, observation_size: int, action_size: int, hidden_sizes: tuple[int, ...]) -> None:
-        super().__init__()
-        self.value = mlp((observation_size, *hidden_sizes, 1), nn.ReLU, inplace=True)
-        sizes = (observation_size + action_size, *hidden_sizes, 1)
-        self.action_values = nn.ModuleList(mlp(sizes, nn.ReLU, inplace=True) for _ in range(2))
-        self.slow_action_values = copy.deepcopy(self.action_values).requires_grad_(False)
-
-    def advantage(self, observation: Tensor, action: Tensor) -> Tensor:
-        """Return min Q - V (...), by the slow Q, with the gradient of V alone."""
-        pair = torch.cat([observation, action], dim=-1)
-        first, second = (network(pair) for network in self.slow_action_values)
-        return torch.as_tensor((torch.minimum(first, second) - self.value(observation)).squeeze(-1))
-
-
 class Iql:
     """A training in progress, after so many `updates` of critics and policy."""
 
-    def __init__(self, policy: Policy, experience: Experience, config: IqlConfig, *, seed: int) -> None:
+    def __init__(self, policy: "Policy", experience: Experience, config: IqlConfig, *, seed: int) -> None:
+        from astra_data.policies.networks import Critics
+
         self.policy, self.config, self.seed = policy, config, seed
         self.updates = 0
         self._experience = experience
         self._transitions = transitions(experience, config)
         torch.manual_seed(derive(seed, "critics"))
         observed, acted = experience.observation.shape[-1], experience.action.shape[-1]
-        self._critics = _Critics(observed, acted, _CRITIC_SIZES).to(experience.observation.device)
+        self._critics = Critics(observed, acted, _CRITIC_SIZES).to(experience.observation.device)
         slow, fast = self._critics.slow_action_values, self._critics.action_values
         # Listed once, since finding a network's parameters takes as long as updating them.
         self._slow: list[Tensor] = [*slow.parameters()]
@@ -200,11 +186,11 @@ class Iql:
         loss = -(self._weights[steps][learned] * likelihood).mean()
         self._optimizer.zero_grad()
         loss.backward()
-        nn.utils.clip_grad_norm_(self._policy_parameters, _GRADIENT_NORM)
+        torch.nn.utils.clip_grad_norm_(self._policy_parameters, _GRADIENT_NORM)
         self._optimizer.step()
         return {"policy": float(loss.detach())}
 
-    @torch.no_grad()
+    @without_gradients
     def _weigh(self) -> Tensor:
         """Return the weight exp(β (Q - V)) of each recorded step, (E, T), by the finished critics."""
         columns = self._experience.observation, self._experience.action
@@ -230,7 +216,7 @@ def transitions(experience: Experience, config: IqlConfig) -> Transitions:
     step = torch.arange(experience.reward.shape[1], device=lengths.device).expand_as(experience.reward)
     reward = (experience.reward * config.reward_scale) * (step < lengths)
     weights = config.discount ** torch.arange(count, device=reward.device)
-    summed = (nn.functional.pad(reward, (0, count - 1)).unfold(1, count, 1) * weights).sum(-1)
+    summed = (torch.nn.functional.pad(reward, (0, count - 1)).unfold(1, count, 1) * weights).sum(-1)
     last = (step + count - 1).minimum(lengths - 1)
     rows = (torch.arange(len(lengths), device=lengths.device)[:, None], last)
     terminated = experience.terminated[rows]
@@ -248,12 +234,16 @@ _CHECKPOINT_EVERY = 500
 _POSITION_OCTAVES = 4
 
 
-def _position_features(task: Task) -> PositionFeatures:
+def _position_features(task: Task) -> "PositionFeatures":
+    from astra_data.grounding.encoder import PositionFeatures
+
     return PositionFeatures(_POSITION_OCTAVES if task.plane else 0)
 
 
 def learn_from_episodes(training: Training) -> tuple[PolicyFile, dict[str, Any]]:
     """Learn by IQL from the target's side of the paired episodes; return the policy, and losses every few updates."""
+    from astra_data.policies.networks import ActorCritic, ActorCriticShape
+
     config, episodes = _config(training), training.episodes
     if config.temperature and not episodes.has_rewards:
         raise BadInputError(f"{episodes.reference} has no {REWARD}, from which the policy would be learned")

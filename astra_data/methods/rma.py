@@ -2,26 +2,28 @@
 
 import math
 from dataclasses import dataclass, replace
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import torch
 from pydantic import Field
-from torch import Tensor
-from torch.nn import functional
 
 from astra_data.core.artifact import CHECKPOINT
 from astra_data.core.config import Config, Count, Positive, own_settings
 from astra_data.core.errors import BadInputError
+from astra_data.core.lazy import Tensor, torch
 from astra_data.core.progress import CLOCKS, part
 from astra_data.core.seeding import derive
 from astra_data.grounding.descent import refuse_divergence
 from astra_data.methods.method import Method, Table
 from astra_data.policies.learner import Learner
-from astra_data.policies.networks import SHORTEST_HISTORY, AdaptiveShape, Student, Teacher
 from astra_data.policies.ppo import Ppo
 from astra_data.policies.running_policy import PolicyFile
 from astra_data.policies.train import InSimulator, PpoTrainConfig, Training, optimize
 from astra_data.worlds.protocols import BatchedEnv
+
+if TYPE_CHECKING:
+    from astra_data.policies.networks import Teacher
+
+SHORTEST_HISTORY = 40  # steps that the student's convolutions span
 
 
 class RmaConfig(Config):
@@ -41,8 +43,10 @@ class Adaptation(Learner):
     """A phase 2 in progress: each step updates the `student`'s estimate of the extrinsics, and nothing else."""
 
     def __init__(
-        self, env: BatchedEnv, teacher: Teacher, config: RmaConfig, *, rollout_steps: int, horizon: int, seed: int
+        self, env: BatchedEnv, teacher: "Teacher", config: RmaConfig, *, rollout_steps: int, horizon: int, seed: int
     ) -> None:
+        from astra_data.policies.networks import Student
+
         self.teacher, self.config = teacher, config
         torch.manual_seed(derive(seed, "student"))
         self.student = Student.of_teacher(teacher)
@@ -81,7 +85,7 @@ class Adaptation(Learner):
             extrinsics = self.teacher.extrinsics(self.observation)
         seen = self.observation[:, : shape.observation_size]
         features, hidden = self.student.remember(seen, self.previous_action, self.hidden)
-        loss = functional.mse_loss(features[:, -shape.extrinsics_size :], extrinsics)
+        loss = torch.nn.functional.mse_loss(features[:, -shape.extrinsics_size :], extrinsics)
         self._optimizer.zero_grad()
         loss.backward()
         self._optimizer.step()
@@ -94,6 +98,8 @@ class TeacherThenStudent(InSimulator):
 
     def __call__(self, training: Training) -> tuple[PolicyFile, dict[str, Any]]:
         """Return the student, and the teacher's learning curve with the student's as "adaptation"."""
+        from astra_data.policies.networks import AdaptiveShape, Teacher
+
         config, seed = training.config, training.seed
         if not isinstance(config, PpoTrainConfig):
             raise BadInputError(f'rma: expected train.learner "ppo", got "{config.learner}"')

@@ -12,10 +12,10 @@ from string import Template
 from typing import Any
 
 import numpy as np
-import torch
 
 from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError
+from astra_data.core.lazy import torch
 from astra_data.dataset.columns import Column
 from astra_data.io.guessing import HEADING, PLACE, TURNED, Field, Logs
 

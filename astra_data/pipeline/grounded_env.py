@@ -3,7 +3,7 @@
 from collections.abc import Collection
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from astra_data.core.config import did_you_mean, validated
 from astra_data.core.errors import BadInputError
@@ -16,17 +16,22 @@ from astra_data.pipeline.plan import Selection, plan
 from astra_data.pipeline.recipe import Recipe
 from astra_data.pipeline.trained_policy import settings_of
 from astra_data.pipeline.user_code import add_all
-from astra_data.policies.gymnasium import BatchedVectorEnv, SeededSimulatorEnv, SingleEnv
-from astra_data.policies.running_policy import ActingPolicy, PolicyFile, UserPolicy
+from astra_data.policies.learner import ActingPolicy
+from astra_data.policies.running_policy import PolicyFile
 from astra_data.policies.simulator_env import Simulation, SimulatorEnv
 from astra_data.policies.train import InSimulator, Training
 from astra_data.robots.registry import task_named
 
+if TYPE_CHECKING:
+    from astra_data.policies.gymnasium import BatchedVectorEnv, SingleEnv
+
 OPTIONS = ("data_start_share", "episode_steps")  # the keywords of an environment, keys of `[train]`
 
 
-def grounded(run: str | Path, row: str, seed: int = 0, percent: int | None = None, **options: Any) -> SingleEnv:
+def grounded(run: str | Path, row: str, seed: int = 0, percent: int | None = None, **options: Any) -> "SingleEnv":
     """Build the environment of one robot in which a row of a run is trained, of `seed`, with `options` of `OPTIONS`."""
+    from astra_data.policies.gymnasium import SeededSimulatorEnv, SingleEnv
+
     env, _, training = _world(run, settings_of(run), row, seed, percent, num_envs=1, **options)
     return SingleEnv(SeededSimulatorEnv(env), training.simulated_steps)
 
@@ -39,8 +44,10 @@ def grounded_vector(
     percent: int | None = None,
     max_episode_steps: int | None = None,
     **options: Any,
-) -> BatchedVectorEnv:
+) -> "BatchedVectorEnv":
     """Build `num_envs` of the environments that `grounded` builds, stepped at once."""
+    from astra_data.policies.gymnasium import BatchedVectorEnv, SeededSimulatorEnv
+
     env, _, training = _world(run, settings_of(run), row, seed, percent, num_envs=num_envs, **options)
     steps = training.simulated_steps
     return BatchedVectorEnv(SeededSimulatorEnv(env), min(steps, max_episode_steps or steps))
@@ -62,6 +69,8 @@ def evaluate_policy(
     """
     settings = settings_of(run)
     env, simulation, training = _world(run, settings, row, seed, percent, num_envs=1)
+    from astra_data.policies.networks import UserPolicy
+
     own = UserPolicy(policy, env.observation_size, env.action_size)
     rows = list(dict.fromkeys([*settings.get("methods", []), row]))
     tested = {"seeds": [seed]} | settings | {"methods": rows}

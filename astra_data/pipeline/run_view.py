@@ -5,12 +5,12 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from astra_data.core.artifact import check_made_from
 from astra_data.core.config import validated
 from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError, optional
+from astra_data.core.lazy import torch
 from astra_data.core.naming import row_of_key
 from astra_data.dataset.columns import ABSTRACT_NEXT_STATE, ABSTRACT_STATE, ACTION, Array, Column
 from astra_data.dataset.edit import check_uids
@@ -23,7 +23,6 @@ from astra_data.pipeline.plan import Selection, plan
 from astra_data.pipeline.recipe import Recipe
 from astra_data.pipeline.stages.registry import STAGES
 from astra_data.pipeline.trained_policy import settings_of
-from astra_data.reports.figures.style import method_color
 from astra_data.robots.registry import task_named
 
 
@@ -59,6 +58,8 @@ def view_run(run: Path, uids: Sequence[int] = (), *, seed: int | None = None, sa
     episodes, task = (episodes.select(torch.isin(episodes.uids, wanted).nonzero()[:, 0]), task_named(recipe.task))
     episodes.check(task)
     replays = {name: replay_open_loop(task, one, episodes, seed=0) for name, one in simulators.items()}
+
+    from astra_data.reports.figures.style import method_color
 
     stream = rerun.RecordingStream("astra-data", recording_id=dataset.reference)
     recorded = stream.binary_stream() if save else None

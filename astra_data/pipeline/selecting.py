@@ -8,13 +8,12 @@ from shutil import copy2
 from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from astra_data.core.artifact import SHEET, finished_folder, read_manifest
 from astra_data.core.config import only_given, validated
 from astra_data.core.durable import alone_in
 from astra_data.core.errors import BadInputError
+from astra_data.core.lazy import Tensor, torch
 from astra_data.core.progress import Progress, part, silent
 from astra_data.core.seeding import derive
 from astra_data.pipeline.by_hand import Ask, Sheet

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from astra_data.core.config import did_you_mean
 from astra_data.core.errors import BadInputError
+from astra_data.worlds.user_code import code_digest
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 
@@ -115,6 +116,13 @@ def whereabouts(name: str) -> str:
         return ""
     place = Path(RECIPES.name) / recipes[alike[0]].path
     return f"did you mean {place}?" if place.is_file() else f"`astra-data recipes copy {alike[0]}` writes {place}"
+
+
+def is_shipped(place: str) -> bool:
+    """Return whether the task at a `place`, such as cart.py:TASK, is that of a recipe or a copy of it."""
+    tasks = {str(RECIPES / recipe.path.parent / recipe.task) for recipe in shipped_recipes()}
+    alike = [task for task in tasks if Path(task).name == Path(place).name]
+    return any(code_digest(task) == code_digest(place) for task in alike)
 
 
 def copy_recipe(name: str, folder: Path) -> list[Path]:

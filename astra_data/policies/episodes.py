@@ -9,10 +9,9 @@ from statistics import fmean
 from typing import NamedTuple, Self
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from astra_data.core.errors import AstraDataError, BadInputError
+from astra_data.core.lazy import Tensor, torch, without_gradients
 from astra_data.core.progress import Progress, silent
 from astra_data.core.seeding import derive
 from astra_data.dataset.columns import ACTION
@@ -121,7 +120,7 @@ def started(policy: RunningPolicy, act: Act, goal: Tensor) -> Act:
     return act
 
 
-@torch.no_grad()
+@without_gradients
 def in_simulator(
     world: SimulatorEnv,
     begin: Begin,

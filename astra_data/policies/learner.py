@@ -1,20 +1,57 @@
-"""The base of learners that act in an environment: seeded iterations, and checkpoints."""
+"""What a learner of the user's makes; the base of those that act in an environment: seeded iterations, checkpoints."""
 
 import math
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from statistics import fmean
-from typing import Any
+from typing import Any, ClassVar, Protocol, Self
 
-import torch
-from torch import Tensor
+from numpy.typing import NDArray
 
+from astra_data.core.errors import BadInputError
+from astra_data.core.lazy import Tensor, torch
 from astra_data.core.seeding import derive
 from astra_data.worlds.protocols import BatchedEnv, Step
 
 _ROUNDING = 1e-9  # of a sum of shares
 _ROWS = ("previous_action", "hidden", "first", "age", "lasted")  # what checkpoints hold of the rows
+
+
+class ActingPolicy(Protocol):
+    """What a policy of another learner has to have."""
+
+    def act(self, observation: NDArray[Any]) -> NDArray[Any]:
+        """Return actions (B, A) within ±1 for observations (B, O) float32."""
+        ...
+
+
+class SavedPolicy(ActingPolicy, Protocol):
+    """What a policy has to have that a learner of the user's makes for a row."""
+
+    kind: ClassVar[str]  # names the class in files; see `KINDS`
+
+    def to_file(self) -> tuple[Mapping[str, Tensor], dict[str, Any]]:
+        """Return tensors, at least one, and metadata (JSON values) from which `from_file` rebuilds it."""
+        ...
+
+    @classmethod
+    def from_file(cls, tensors: dict[str, Tensor], metadata: Mapping[str, Any]) -> Self:
+        """Rebuild it."""
+        ...
+
+
+PACKAGE_KINDS = ("actor_critic", "adaptive", "soft_actor")  # what files call the networks of the package
+KINDS: dict[str, type[SavedPolicy]] = {}
+"""The classes of such policies by their kinds, as methods of the user's add them."""
+
+
+def add_policy_kind(made: type[SavedPolicy]) -> None:
+    """Let files hold policies of another learner."""
+    if made.kind in PACKAGE_KINDS or KINDS.setdefault(made.kind, made) is not made:
+        raise BadInputError(
+            f"policies of kind '{made.kind}' are the package's or another learner's: rename that of {made.__name__}"
+        )
 
 
 class Learner(ABC):

@@ -1,15 +1,22 @@
 """The base of all policies: a recurrent memory where observations hold no latent, and a head that acts."""
 
+import copy
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from astra_data.core.arrays import gaussian_log_prob
+from astra_data.core.errors import BadInputError
 from astra_data.grounding.encoder import HistoryEncoder, mlp
+from astra_data.policies.learner import PACKAGE_KINDS, ActingPolicy
+from astra_data.worlds.user_code import explained
 
 _SMALLEST_SQUASHED = 1e-6 - 1.0  # actions beyond it are taken for it, since the tanh of no number is -1
 
@@ -47,11 +54,6 @@ def features_of(
         return observation
     inputs = torch.cat([observation, previous_action], dim=-1)
     return torch.cat([observation, memory.latent(memory.through_episodes(inputs, hidden, start))], dim=-1)
-
-
-def gaussian_log_prob(mean: Tensor, std: Tensor, value: Tensor) -> Tensor:
-    """Return the log-density (...) of `value` (..., A) under independent Gaussians (..., A)."""
-    return (((value - mean) / std).square() / -2 - std.log() - math.log(2 * math.pi) / 2).sum(-1)
 
 
 class Policy(nn.Module, ABC):
@@ -176,9 +178,6 @@ class SoftActor(Policy):
         return torch.tanh(loc if generator is None else torch.normal(loc, scale, generator=generator))
 
 
-SHORTEST_HISTORY = 40  # steps that the student's convolutions span
-
-
 @dataclass(frozen=True)
 class AdaptiveShape(ActorCriticShape):
     """Sizes of teacher and student."""
@@ -229,7 +228,7 @@ class HistoryEstimate(nn.Module):
         self.convolutions = nn.Sequential(
             nn.Conv1d(32, 32, 8, stride=4), nn.ELU(), nn.Conv1d(32, 32, 5), nn.ELU(), nn.Conv1d(32, 32, 5)
         )
-        moments = (length - SHORTEST_HISTORY) // 4 + 1
+        moments = self.convolutions(torch.zeros(1, 32, length)).shape[-1]
         self.head = nn.Linear(32 * moments, extrinsics_size)
 
     def forward(self, history: Tensor) -> Tensor:
@@ -281,3 +280,87 @@ class Student(ActorCritic):
             seen, hidden = self.remember(observation[:, step], previous_action[:, step], hidden)
             features.append(seen)
         return torch.stack(features, dim=1)
+
+
+class Critics(nn.Module):
+    """V, two Q, and slow copies of these, of observations (..., O) and actions (..., A)."""
+
+    def __init__(self, observation_size: int, action_size: int, hidden_sizes: tuple[int, ...]) -> None:
+        super().__init__()
+        self.value = mlp((observation_size, *hidden_sizes, 1), nn.ReLU, inplace=True)
+        sizes = (observation_size + action_size, *hidden_sizes, 1)
+        self.action_values = nn.ModuleList(mlp(sizes, nn.ReLU, inplace=True) for _ in range(2))
+        self.slow_action_values = copy.deepcopy(self.action_values).requires_grad_(False)
+
+    def advantage(self, observation: Tensor, action: Tensor) -> Tensor:
+        """Return min Q - V (...), by the slow Q, with the gradient of V alone."""
+        pair = torch.cat([observation, action], dim=-1)
+        first, second = (network(pair) for network in self.slow_action_values)
+        return torch.as_tensor((torch.minimum(first, second) - self.value(observation)).squeeze(-1))
+
+
+class RecurrentCritics(nn.Module):
+    """Two action values, and the memory that both share; layer normalization keeps them from diverging."""
+
+    def __init__(self, shape: PolicyShape) -> None:
+        super().__init__()
+        self.memory = shape.new_memory()
+        self.networks = nn.ModuleList(_action_value(shape) for _ in range(2))
+
+    def features(self, observation: Tensor, previous_action: Tensor, first: Tensor) -> Tensor:
+        """Return the features (B, T, F) of windows of (B, T, ...), before which nothing is remembered."""
+        nothing = observation.new_zeros(len(observation), 0 if self.memory is None else self.memory.latent_size)
+        return features_of(self.memory, observation, previous_action, nothing, first)
+
+    def forward(self, features: Tensor, action: Tensor) -> Tensor:
+        """Return both values (2, ...) of features (..., F) and actions (..., A)."""
+        pair = torch.cat([features, action], dim=-1)
+        return torch.stack([network(pair).squeeze(-1) for network in self.networks])
+
+
+def _action_value(shape: PolicyShape) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    sizes = shape.feature_size + shape.action_size, *shape.hidden_sizes
+    for size_in, size_out in pairwise(sizes):
+        layers += [nn.Linear(size_in, size_out), nn.LayerNorm(size_out), nn.ReLU(inplace=True)]
+    return nn.Sequential(*layers, nn.Linear(sizes[-1], 1))
+
+
+class UserPolicy(Policy):
+    """A policy of another learner, in the place of one that was trained here; it has no memory."""
+
+    def __init__(self, acting: ActingPolicy, observation_size: int, action_size: int) -> None:
+        super().__init__(PolicyShape(observation_size, action_size))
+        if not callable(getattr(acting, "act", None)):
+            raise BadInputError(f"{type(acting).__name__} is no policy: expected act(observation) -> action")
+        self.acting = acting
+
+    @property
+    def name(self) -> str:
+        """The name of its class."""
+        return type(self.acting).__name__
+
+    def initial_hidden(self, count: int) -> Tensor:
+        """Return no memory, (count, 0)."""
+        return torch.zeros(count, 0)
+
+    def policy(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the actions (B, A) for observations (B, O), and a scale of 0."""
+        action = self.act(features)
+        return action, torch.zeros_like(action)
+
+    def act(self, features: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """Return the actions (B, A), clipped to ±1, for observations (B, O); `generator` has no effect."""
+        with explained(f"{self.name}.act"):
+            action = np.asarray(self.acting.act(features.numpy()), dtype=np.float32)
+        expected = (len(features), self.shape.action_size)
+        if action.shape != expected:
+            raise BadInputError(f"{self.name}.act: expected actions of shape {expected}, got {action.shape}")
+        if not np.isfinite(action).all():
+            raise BadInputError(f"{self.name}.act: expected finite actions, got NaN or infinity")
+        return torch.from_numpy(action).clamp(-1.0, 1.0)
+
+
+_MADE = ((ActorCritic, ActorCriticShape), (Student, AdaptiveShape), (SoftActor, PolicyShape))
+NETWORKS: dict[str, tuple[type[Policy], type[PolicyShape]]] = dict(zip(PACKAGE_KINDS, _MADE, strict=True))
+"""The policies of the package, with their shapes, by what their files call them."""

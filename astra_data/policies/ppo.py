@@ -1,17 +1,19 @@
 """Proximal policy optimization (Schulman et al. 2017) on a batched environment."""
 
 import math
+from typing import TYPE_CHECKING
 
-import torch
-from torch import Tensor, nn
-
+from astra_data.core.arrays import gaussian_log_prob
 from astra_data.core.config import Config, Count, Positive, Share
 from astra_data.core.errors import BadInputError
+from astra_data.core.lazy import Tensor, torch, without_gradients
 from astra_data.core.seeding import derive
 from astra_data.grounding.descent import refuse_divergence
 from astra_data.policies.learner import Learner
-from astra_data.policies.networks import ActorCritic, gaussian_log_prob
 from astra_data.worlds.protocols import BatchedEnv
+
+if TYPE_CHECKING:
+    from astra_data.policies.networks import ActorCritic
 
 EPOCHS, MINIBATCHES = 5, 16  # passes over a rollout, and updates per pass
 _SEGMENT_STEPS = 16  # at most, of a segment: it begins with the memory that the policy had there when it acted
@@ -47,7 +49,7 @@ class PpoConfig(Config):
 class Ppo(Learner):
     """A training in progress."""
 
-    def __init__(self, env: BatchedEnv, policy: ActorCritic, config: PpoConfig, *, horizon: int, seed: int) -> None:
+    def __init__(self, env: BatchedEnv, policy: "ActorCritic", config: PpoConfig, *, horizon: int, seed: int) -> None:
         if env.num_envs * config.rollout_steps == 1:
             raise BadInputError("rollout_steps: expected 2 or more in a single environment, got 1")
         self.policy, self.config = policy, config
@@ -80,7 +82,7 @@ class Ppo(Learner):
         refuse_divergence(f"after step {self.steps}", figures)
         return figures
 
-    @torch.no_grad()
+    @without_gradients
     def _collect(self) -> dict[str, Tensor]:
         policy, columns, memories = self.policy, dict[str, list[Tensor]](), list[Tensor]()
         for number in range(self.rollout_steps):
@@ -129,7 +131,7 @@ class Ppo(Learner):
                     return
                 self._optimizer.zero_grad()
                 loss.backward()
-                nn.utils.clip_grad_norm_(self.policy.parameters(), GRADIENT_NORM)
+                torch.nn.utils.clip_grad_norm_(self.policy.parameters(), GRADIENT_NORM)
                 self._optimizer.step()
 
     def _loss(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
@@ -176,7 +178,7 @@ _LARGEST = 10.0  # scaled rewards are clipped to this
 class ReturnScale:
     """The running deviation of discounted sums of B rows' rewards, as in VecNormalize of OpenAI Baselines."""
 
-    def __init__(self, num_envs: int, discount: float, device: torch.device) -> None:
+    def __init__(self, num_envs: int, discount: float, device: "torch.device") -> None:
         self.discount = discount
         self.sums = torch.zeros(num_envs, device=device)
         self.count, self.mean, self.var = torch.tensor([1e-4, 0.0, 1.0], dtype=torch.float64, device=device)

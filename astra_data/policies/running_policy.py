@@ -1,92 +1,30 @@
-"""Policies of other learners, which act on the observations of a row's environment."""
+"""Trained policies: on robots, and in files."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal, NamedTuple, Protocol, Self
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from astra_data.core.checkpoint import as_part, loaded, part_of, save_tensors, understood
 from astra_data.core.errors import BadInputError
-from astra_data.grounding.alignment import TargetEncoder
-from astra_data.grounding.encoder import LatentEncoder
+from astra_data.core.lazy import Tensor, torch, without_gradients
 from astra_data.grounding.features import encoded
-from astra_data.grounding.simulator import NO_GROUNDING, Grounding
-from astra_data.policies import networks
-from astra_data.policies.networks import Policy, PolicyShape
+from astra_data.grounding.simulator import NO_GROUNDING, Grounding, LatentEncoder
+from astra_data.policies.learner import KINDS
 from astra_data.policies.simulator_env import Simulation, WorldConfig, policy_observation
 from astra_data.worlds.objective import NO_LIMIT
 from astra_data.worlds.task import Task
-from astra_data.worlds.user_code import explained, parts_of, restored
+from astra_data.worlds.user_code import parts_of, restored
 from astra_data.worlds.variation import Variation
 
+if TYPE_CHECKING:
+    from astra_data.grounding.alignment import TargetEncoder
+    from astra_data.policies.networks import Policy
+
 Array = NDArray[Any]
-
-
-class ActingPolicy(Protocol):
-    """What a policy of another learner has to have."""
-
-    def act(self, observation: Array) -> Array:
-        """Return actions (B, A) within ±1 for observations (B, O) float32."""
-        ...
-
-
-class SavedPolicy(ActingPolicy, Protocol):
-    """What a policy has to have that a learner of the user's makes for a row."""
-
-    kind: ClassVar[str]  # names the class in files; see `KINDS`
-
-    def to_file(self) -> tuple[Mapping[str, Tensor], dict[str, Any]]:
-        """Return tensors, at least one, and metadata (JSON values) from which `from_file` rebuilds it."""
-        ...
-
-    @classmethod
-    def from_file(cls, tensors: dict[str, Tensor], metadata: Mapping[str, Any]) -> Self:
-        """Rebuild it."""
-        ...
-
-
-KINDS: dict[str, type[SavedPolicy]] = {}
-"""The classes of such policies by their kinds, as methods of the user's add them."""
-
-
-class UserPolicy(Policy):
-    """A policy of another learner, in the place of one that was trained here; it has no memory."""
-
-    def __init__(self, acting: ActingPolicy, observation_size: int, action_size: int) -> None:
-        super().__init__(PolicyShape(observation_size, action_size))
-        if not callable(getattr(acting, "act", None)):
-            raise BadInputError(f"{type(acting).__name__} is no policy: expected act(observation) -> action")
-        self.acting = acting
-
-    @property
-    def name(self) -> str:
-        """The name of its class."""
-        return type(self.acting).__name__
-
-    def initial_hidden(self, count: int) -> Tensor:
-        """Return no memory, (count, 0)."""
-        return torch.zeros(count, 0)
-
-    def policy(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the actions (B, A) for observations (B, O), and a scale of 0."""
-        action = self.act(features)
-        return action, torch.zeros_like(action)
-
-    def act(self, features: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """Return the actions (B, A), clipped to ±1, for observations (B, O); `generator` has no effect."""
-        with explained(f"{self.name}.act"):
-            action = np.asarray(self.acting.act(features.numpy()), dtype=np.float32)
-        expected = (len(features), self.shape.action_size)
-        if action.shape != expected:
-            raise BadInputError(f"{self.name}.act: expected actions of shape {expected}, got {action.shape}")
-        if not np.isfinite(action).all():
-            raise BadInputError(f"{self.name}.act: expected finite actions, got NaN or infinity")
-        return torch.from_numpy(action).clamp(-1.0, 1.0)
 
 
 Given = Tensor | NDArray[np.float32] | NDArray[np.float64]  # what measures and goals come in
@@ -119,12 +57,12 @@ class RunningPolicy:
     """
 
     task: Task
-    policy: Policy
+    policy: "Policy"
     source_encoder: LatentEncoder | None = None  # ψ^s; None for a policy without latents
     target_encoder: LatentEncoder | None = None  # ψ^t; where it is None, ψ^s is used
     command_limit: float = NO_LIMIT  # that of the environment in which the policy was trained
     observed: Observed = "abstract"  # whether the policy observes φ of the target's state, or the full state
-    sensing: TargetEncoder | None = None
+    sensing: "TargetEncoder | None" = None
 
     def __post_init__(self) -> None:
         """Check that what the encoder reads is there."""
@@ -144,7 +82,7 @@ class RunningPolicy:
         seen = target_observation(self.task, state, goal, None, self.observed)
         return seen.shape[1] + (self.source_encoder.encoder.latent_size if self.source_encoder else 0)
 
-    def start(self, count: int, generator: torch.Generator | None = None) -> None:
+    def start(self, count: int, generator: "torch.Generator | None" = None) -> None:
         """Start B = `count` episodes without history; with `generator`, draw actions as in training."""
         still = torch.zeros(count, self.policy.shape.action_size)
         encoder = self.target_encoder or self.source_encoder
@@ -176,7 +114,7 @@ class RunningPolicy:
             raise BadInputError("expected states, got a dict, which policies take that were aligned with `inputs`")
         return self._checked("state", given, self.task.state.size)
 
-    def _inputs(self, given: Given | Shown, sensing: TargetEncoder) -> Tensor:
+    def _inputs(self, given: Given | Shown, sensing: "TargetEncoder") -> Tensor:
         """Return the inputs in the place of states, (B, S), features of pictures among them."""
         shown, read = given if isinstance(given, Mapping) else {}, list[Tensor]()
         for name, size in sensing.inputs.items():
@@ -220,13 +158,13 @@ class RunningPolicy:
         latent = self._latent(self.source_encoder, abstract, goal)
         return self._act(policy_observation(self.task.objective, abstract, goal, latent))
 
-    @torch.no_grad()
-    def _estimate(self, sensing: TargetEncoder, inputs: Tensor, goal: Tensor) -> Tensor:
+    @without_gradients
+    def _estimate(self, sensing: "TargetEncoder", inputs: Tensor, goal: Tensor) -> Tensor:
         read = sensing.encoder_input(inputs, goal, self.memory.previous_action)
         self._estimated = sensing.estimator.step(read, self._estimated)
         return sensing.estimates(self._estimated)
 
-    @torch.no_grad()
+    @without_gradients
     def _latent(self, encoder: LatentEncoder | None, seen: Tensor, goal: Tensor) -> Tensor | None:
         if encoder is None:
             return None
@@ -235,7 +173,7 @@ class RunningPolicy:
         self.memory = self.memory._replace(encoder=hidden)
         return encoder.encoder.latent(hidden)
 
-    @torch.no_grad()
+    @without_gradients
     def _act(self, observation: Tensor) -> Tensor:
         before = self.memory
         features, hidden = self.policy.remember(observation, before.previous_output, before.policy)
@@ -246,27 +184,14 @@ class RunningPolicy:
 
 
 POLICY = "policy.safetensors"  # name of the file of its artifact
-_KINDS: dict[str, tuple[type[Policy], type[PolicyShape]]] = {
-    "actor_critic": (networks.ActorCritic, networks.ActorCriticShape),
-    "adaptive": (networks.Student, networks.AdaptiveShape),
-    "soft_actor": (networks.SoftActor, PolicyShape),
-}
 _PART = "policy"  # of the tensors of a file: the policy's networks
-
-
-def add_policy_kind(made: type[SavedPolicy]) -> None:
-    """Let files hold policies of another learner."""
-    if made.kind in _KINDS or KINDS.setdefault(made.kind, made) is not made:
-        raise BadInputError(
-            f"policies of kind '{made.kind}' are the package's or another learner's: rename that of {made.__name__}"
-        )
 
 
 @dataclass(frozen=True)
 class PolicyFile:
     """A trained policy."""
 
-    policy: Policy
+    policy: "Policy"
     simulation: Simulation | None  # that it was trained in; None if it was trained in the target, or on data
     dataset: str | None  # that everything was learned from; None for a policy that was trained to collect one
     content_hash: str | None  # of the dataset
@@ -274,6 +199,8 @@ class PolicyFile:
 
     def save(self, path: Path) -> None:
         """Write the policy to `path`."""
+        from astra_data.policies.networks import NETWORKS, UserPolicy
+
         policy = self.policy
         metadata: dict[str, Any] = {"shape": asdict(policy.shape), "dataset": self.dataset}
         metadata |= {"hash": self.content_hash, "observed": self.observed}
@@ -282,7 +209,7 @@ class PolicyFile:
             weights, metadata["own"] = parts_of(saved)
             metadata["kind"] = saved.kind
         else:
-            weights, kinds = policy.state_dict(), {made: kind for kind, (made, _) in _KINDS.items()}
+            weights, kinds = policy.state_dict(), {made: kind for kind, (made, _) in NETWORKS.items()}
             if type(policy) not in kinds:
                 known = f"a {', '.join(made.__name__ for made in kinds)}, or what an UserLearner learns"
                 raise BadInputError(f"a {type(policy).__name__} cannot be read again: expected {known}")
@@ -296,14 +223,16 @@ class PolicyFile:
     @classmethod
     def load(cls, path: Path | str, device: str = "cpu") -> "PolicyFile":
         """Read a policy; its parameters are frozen."""
-        with understood(Path(path), "a policy", {**_KINDS, **KINDS}, device) as (tensors, metadata):
+        from astra_data.policies.networks import NETWORKS, Policy, UserPolicy
+
+        with understood(Path(path), "a policy", (*NETWORKS, *KINDS), device) as (tensors, metadata):
             weights, simulation = part_of(tensors, _PART), None
             shape = metadata["shape"] | {"hidden_sizes": tuple(metadata["shape"]["hidden_sizes"])}
             if "own" in metadata:
                 acting = restored(KINDS[metadata["kind"]], weights, metadata["own"])
                 policy: Policy = UserPolicy(acting, shape["observation_size"], shape["action_size"])
             else:
-                made, shaped = _KINDS[metadata["kind"]]
+                made, shaped = NETWORKS[metadata["kind"]]
                 policy = loaded(made(shaped(**shape)), weights, device)
             if recorded := metadata.get("simulation"):
                 variation = recorded["variation"]
@@ -315,8 +244,8 @@ def running(
     task: Task,
     trained: PolicyFile,
     grounding: Grounding = NO_GROUNDING,
-    target_encoder: TargetEncoder | None = None,
-    sensing: TargetEncoder | None = None,
+    target_encoder: "TargetEncoder | None" = None,
+    sensing: "TargetEncoder | None" = None,
 ) -> RunningPolicy:
     """Return the policy, ready to be started; latents, if any, come from ψ^t, or without it from ψ^s.
 

@@ -6,20 +6,20 @@ critics share another memory, which is empty there.
 
 import copy
 from collections.abc import Mapping
-from itertools import pairwise
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
-import torch
 from pydantic import model_validator
-from torch import Tensor, nn
 
 from astra_data.core.config import Config, Count, CountFromZero, Positive, Share
 from astra_data.core.errors import BadInputError
+from astra_data.core.lazy import Tensor, torch, without_gradients
 from astra_data.core.seeding import derive
 from astra_data.grounding.descent import refuse_divergence
 from astra_data.policies.learner import Learner
-from astra_data.policies.networks import PolicyShape, SoftActor, features_of
 from astra_data.worlds.protocols import BatchedEnv
+
+if TYPE_CHECKING:
+    from astra_data.policies.networks import SoftActor
 
 _REWARD_SCALE = 0.1  # factor on the reward that the critics learn from
 _INITIAL_TEMPERATURE = 0.2  # weight of the entropy in the reward at the start
@@ -61,13 +61,15 @@ class SacConfig(Config):
 class Sac(Learner):
     """A training in progress, of the actor `policy`."""
 
-    def __init__(self, env: BatchedEnv, policy: SoftActor, config: SacConfig, *, horizon: int, seed: int) -> None:
+    def __init__(self, env: BatchedEnv, policy: "SoftActor", config: SacConfig, *, horizon: int, seed: int) -> None:
+        from astra_data.policies.networks import RecurrentCritics
+
         self.policy, self.config = policy, config
         torch.manual_seed(derive(seed, "critics"))
         device = next(policy.parameters()).device
-        self._critics = _Critics(policy.shape).to(device)
+        self._critics = RecurrentCritics(policy.shape).to(device)
         self._late_critics = copy.deepcopy(self._critics).requires_grad_(False)
-        self._log_temperature = nn.Parameter(torch.tensor(_INITIAL_TEMPERATURE, device=device).log())
+        self._log_temperature = torch.nn.Parameter(torch.tensor(_INITIAL_TEMPERATURE, device=device).log())
         learned = [*policy.parameters(), *self._critics.parameters(), self._log_temperature]
         self._optimizer = torch.optim.Adam(learned, lr=config.learning_rate, fused=True)
         self._window, self._burn_in = (config.window, config.burn_in) if policy.memory else (1, 0)
@@ -85,7 +87,7 @@ class Sac(Learner):
                 "policy": policy,
                 "critics": self._critics,
                 "late_critics": self._late_critics,
-                "temperature": nn.ParameterDict({"log": self._log_temperature}),
+                "temperature": torch.nn.ParameterDict({"log": self._log_temperature}),
                 "optimizer": self._optimizer,
                 "replay": self._replay,
             },
@@ -110,7 +112,7 @@ class Sac(Learner):
     def _cut(self) -> None:
         self._replay.cut()
 
-    @torch.no_grad()
+    @without_gradients
     def _act(self) -> None:
         names = ("observation", "previous_action", "hidden", "first")
         seen = {name: getattr(self, name) for name in names}
@@ -156,37 +158,10 @@ class Sac(Learner):
         return critic_loss, actor_loss, self._log_temperature * surplus
 
 
-class _Critics(nn.Module):
-    """Two action values, and the memory that both share; layer normalization keeps them from diverging."""
-
-    def __init__(self, shape: PolicyShape) -> None:
-        super().__init__()
-        self.memory = shape.new_memory()
-        self.networks = nn.ModuleList(_action_value(shape) for _ in range(2))
-
-    def features(self, observation: Tensor, previous_action: Tensor, first: Tensor) -> Tensor:
-        """Return the features (B, T, F) of windows of (B, T, ...), before which nothing is remembered."""
-        nothing = observation.new_zeros(len(observation), 0 if self.memory is None else self.memory.latent_size)
-        return features_of(self.memory, observation, previous_action, nothing, first)
-
-    def forward(self, features: Tensor, action: Tensor) -> Tensor:
-        """Return both values (2, ...) of features (..., F) and actions (..., A)."""
-        pair = torch.cat([features, action], dim=-1)
-        return torch.stack([network(pair).squeeze(-1) for network in self.networks])
-
-
-def _action_value(shape: PolicyShape) -> nn.Sequential:
-    layers: list[nn.Module] = []
-    sizes = shape.feature_size + shape.action_size, *shape.hidden_sizes
-    for size_in, size_out in pairwise(sizes):
-        layers += [nn.Linear(size_in, size_out), nn.LayerNorm(size_out), nn.ReLU(inplace=True)]
-    return nn.Sequential(*layers, nn.Linear(sizes[-1], 1))
-
-
 class Replay:
     """A ring buffer of the last steps of B environments, in contiguous tensors."""
 
-    def __init__(self, size: int, env: BatchedEnv, memory_size: int, device: torch.device) -> None:
+    def __init__(self, size: int, env: BatchedEnv, memory_size: int, device: "torch.device") -> None:
         """Hold the last `size` steps of `env`, the same number per row, with memories of `memory_size`."""
         self._rows = size // env.num_envs
         self._added = 0

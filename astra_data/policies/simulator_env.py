@@ -4,13 +4,10 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from astra_data.core.arrays import Floats
 from astra_data.core.config import Config, NotNegative, Positive, Share
-from astra_data.grounding.failures import averages_before, failing
-from astra_data.grounding.history import HistoryGrounding
+from astra_data.core.lazy import Tensor, torch, without_gradients
 from astra_data.grounding.paired_episodes import RISK_STEPS, PairedEpisodes
 from astra_data.grounding.simulator import EpisodeSimulator, Grounding
 from astra_data.worlds.objective import NO_LIMIT, Objective
@@ -174,11 +171,13 @@ _ALONG_AN_AXIS = 1.0
 _LEAST_RATIO = 1.5  # of the rates of failures above and below the limit
 
 
-@torch.no_grad()
+@without_gradients
 def command_limit(task: Task, episodes: PairedEpisodes) -> float:
     """Return 1, the largest velocity command along an axis, if failures are more frequent above, else `NO_LIMIT`."""
     if task.plane is None:
         return NO_LIMIT
+    from astra_data.grounding.failures import failing
+
     windows = episodes.windows
     length = windows.action[..., :2].norm(dim=-1).double() * windows.mask
     total, count = length.cumsum(1), windows.mask.double().cumsum(1)
@@ -209,11 +208,14 @@ class Simulation:
     variation: Variation | None = None  # ranges of the simulator's parameters, drawn for each episode
 
 
-@torch.no_grad()
+@without_gradients
 def data_starts(task: Task, world: WorldConfig, episodes: PairedEpisodes, grounding: Grounding) -> DataStarts | None:
     """Return the recorded moments that episodes may start from; None unless `world` asks for them."""
     if not world.data_start_share:
         return None
+    from astra_data.grounding.failures import averages_before
+    from astra_data.grounding.history import HistoryGrounding
+
     windows, every, used = episodes.windows, grounding.start_stride, _used(grounding, world)
     moments = windows.mask[:, ::every].bool()
     hidden = used.hidden_before(windows, every)
@@ -227,6 +229,8 @@ def data_starts(task: Task, world: WorldConfig, episodes: PairedEpisodes, ground
 
 def _used(grounding: Grounding, world: WorldConfig) -> Grounding:
     """Return what `world` makes use of in a grounding: its failure model only where failures have a price."""
+    from astra_data.grounding.history import HistoryGrounding
+
     if world.reward != "abstract" or not isinstance(grounding, HistoryGrounding):
         return grounding
     return replace(grounding, failures=None)

@@ -8,23 +8,22 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import torch
 from pydantic import Discriminator, Tag
 
 from astra_data.core.artifact import CHECKPOINT
 from astra_data.core.checkpoint import Logbook
 from astra_data.core.config import AtOnce, Config, Count, CountFromZero, Share, choice
 from astra_data.core.errors import BadInputError
+from astra_data.core.lazy import torch
 from astra_data.core.progress import CLOCKS, Progress, part
 from astra_data.core.seeding import derive
 from astra_data.grounding.files import grounding_at
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.simulator import Grounding
 from astra_data.policies.episodes import ObservedTargetEnv, Reached, reached_in_own_world
-from astra_data.policies.learner import FAST, Learner, is_mastered, lately, penalty_scale
-from astra_data.policies.networks import ActorCritic, ActorCriticShape, Policy, PolicyShape, SoftActor
+from astra_data.policies.learner import FAST, Learner, SavedPolicy, is_mastered, lately, penalty_scale
 from astra_data.policies.ppo import Ppo, PpoConfig
-from astra_data.policies.running_policy import POLICY, Observed, PolicyFile, SavedPolicy, UserPolicy
+from astra_data.policies.running_policy import POLICY, Observed, PolicyFile
 from astra_data.policies.sac import Sac, SacConfig
 from astra_data.policies.simulator_env import (
     RewardSource,
@@ -38,6 +37,10 @@ from astra_data.policies.simulator_env import (
 )
 from astra_data.worlds.task import Task
 from astra_data.worlds.variation import Variation
+
+if TYPE_CHECKING:
+    from astra_data.policies.gymnasium import WatchedEnv
+    from astra_data.policies.networks import Policy
 
 
 class TrainConfig(Config):
@@ -111,7 +114,7 @@ class Training:
         """Steps after which simulated episodes are cut off."""
         return self.config.episode_steps or self.task.objective.horizon
 
-    def learned(self, policy: Policy, simulation: Simulation | None, observed: Observed = "abstract") -> PolicyFile:
+    def learned(self, policy: "Policy", simulation: Simulation | None, observed: Observed = "abstract") -> PolicyFile:
         """Return the policy as learned from the episodes, in the simulator of a `simulation`, if in one."""
         return PolicyFile(policy, simulation, self.episodes.reference, self.episodes.content_hash, observed)
 
@@ -153,8 +156,10 @@ class InSimulator:
 
 def train_in(
     env: TrainingEnv, config: PpoTrainConfig | SacTrainConfig, memory_size: int, training: Training, horizon: int
-) -> tuple[Policy, dict[str, Any]]:
+) -> tuple["Policy", dict[str, Any]]:
     """Train a new policy in `env`, of episodes of at most `horizon` steps; return it and its learning curve."""
+    from astra_data.policies.networks import ActorCritic, ActorCriticShape, PolicyShape, SoftActor
+
     torch.manual_seed(derive(training.seed, "policy"))
     shape = PolicyShape(env.observation_size, env.action_size, memory_size, hidden_sizes=config.hidden_sizes)
     options = {"horizon": horizon, "seed": training.seed}
@@ -269,10 +274,6 @@ def _noted(progress: Progress, which: str, share: float, note: str) -> None:
     progress(share, f"{which}  {note}")
 
 
-if TYPE_CHECKING:
-    from astra_data.policies.gymnasium import WatchedEnv
-
-
 @dataclass(frozen=True, kw_only=True)
 class UserLearner(InSimulator):
     """Train in the abstract simulator by a function of the user's."""
@@ -290,6 +291,7 @@ class UserLearner(InSimulator):
                 "expected --device cpu; run the recipe again with it, finished artifacts are kept"
             )
         from astra_data.policies.gymnasium import WatchedEnv
+        from astra_data.policies.networks import UserPolicy
 
         env, simulation = self.world(training)
         watched = WatchedEnv(env, training)

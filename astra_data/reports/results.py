@@ -13,7 +13,7 @@ from astra_data.core.arrays import Floats
 from astra_data.core.config import read_written
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import reference_of
-from astra_data.grounding.failures import BINS
+from astra_data.grounding.paired_episodes import BINS
 from astra_data.methods import grounded_as, method_role, method_title
 from astra_data.reports.artifacts import Machine
 from astra_data.reports.choice import Choice, Judgment, choice_of

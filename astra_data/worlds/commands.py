@@ -5,10 +5,9 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from astra_data.core.errors import BadInputError
+from astra_data.core.lazy import Tensor, torch
 from astra_data.dataset.columns import ACTION
 from astra_data.dataset.versions import open_dataset
 from astra_data.worlds.protocols import SteppedSimulator
@@ -37,7 +36,7 @@ class Commands(dict[str, tuple[float, float]]):
         if faults:
             raise BadInputError(f"commands: {'; '.join(faults)}")
         super().__init__({name: (float(low), float(high)) for name, (low, high) in bounds.items()})
-        low, high = torch.tensor(list(self.values())).unbind(-1)
+        low, high = np.array(list(self.values()), np.float32).T
         self._middle, self._half = (low + high) / 2, (high - low) / 2
         self.are_normal = {*self.values()} == {(-1.0, 1.0)}  # in their own units already
 
@@ -59,13 +58,15 @@ class Commands(dict[str, tuple[float, float]]):
         clipped = action.clamp(-1.0, 1.0)
         if self.are_normal:
             return clipped
-        return self._middle.to(action.device) + self._half.to(action.device) * clipped
+        middle, half = map(torch.from_numpy, (self._middle, self._half))
+        return middle.to(action.device) + half.to(action.device) * clipped
 
     def normal(self, command: Tensor) -> Tensor:
         """Return commands (..., A) as multiples of ±1; those beyond the bounds are beyond ±1."""
         if self.are_normal:
             return command
-        return (command - self._middle.to(command.device)) / self._half.to(command.device)
+        middle, half = map(torch.from_numpy, (self._middle, self._half))
+        return (command - middle.to(command.device)) / half.to(command.device)
 
 
 class DrivenSimulator:

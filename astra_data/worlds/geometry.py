@@ -3,11 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError
+from astra_data.core.lazy import Tensor, torch
 from astra_data.dataset.columns import Array, Column
 
 

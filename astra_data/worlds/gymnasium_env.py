@@ -4,17 +4,17 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
-import gymnasium
 import numpy as np
 
 from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError
+from astra_data.core.lazy import gymnasium
 from astra_data.worlds.commands import Commands
 from astra_data.worlds.simulators import NumpySimulator
 from astra_data.worlds.task import State
 from astra_data.worlds.user_code import answered, explained
 
-Env = gymnasium.Env[Any, Any]
+type Env = gymnasium.Env[Any, Any]
 _SLACK = 1e-5  # share of the range of an action by which rounding may carry it beyond
 _ADVICE = "give GymnasiumRobot a command, a function of a command and a state that returns an action"
 

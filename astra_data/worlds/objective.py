@@ -5,10 +5,9 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from astra_data.core.arrays import Floats
+from astra_data.core.lazy import Tensor, torch
 from astra_data.worlds.plane.mazes import Maze
 
 

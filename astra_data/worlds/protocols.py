@@ -6,9 +6,9 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
 
 from astra_data.core.arrays import Floats
+from astra_data.core.lazy import Tensor
 from astra_data.dataset.columns import Column
 
 

@@ -4,17 +4,15 @@ import copy
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from typing import Any
 
-import mujoco
 import numpy as np
-import torch
-from mujoco.rollout import Rollout
 from numpy.typing import NDArray
-from torch import Tensor
 
 from astra_data.core.arrays import Bools, Floats
 from astra_data.core.errors import BadInputError
+from astra_data.core.lazy import Tensor, mujoco, torch
 from astra_data.core.provenance import cores
 from astra_data.worlds.plane.mazes import Maze
 
@@ -67,12 +65,14 @@ class NumpySimulator(FreeStates):
 class ColdSteps:
     """Steps of B copies of a MuJoCo model without actuator states, nor the solver's warm start, as pairs need it."""
 
-    def __init__(self, model: mujoco.MjModel, num_envs: int, num_threads: int | None = None) -> None:
+    def __init__(self, model: "mujoco.MjModel", num_envs: int, num_threads: int | None = None) -> None:
+        from mujoco.rollout import Rollout  # noqa: PLC0415 - slow
+
         self._data = [mujoco.MjData(model) for _ in range(min(num_threads or cores(), num_envs))]
         self._rollout = Rollout(nthread=len(self._data))
 
     def __call__(
-        self, model: mujoco.MjModel | Sequence[mujoco.MjModel], motion: Floats, control: Floats, *, substeps: int
+        self, model: "mujoco.MjModel | Sequence[mujoco.MjModel]", motion: Floats, control: Floats, *, substeps: int
     ) -> Floats:
         """Return where `substeps` physics steps lead from `motion`, qpos then qvel (B, N); `control` (B, nu) stays."""
         one = model if isinstance(model, mujoco.MjModel) else model[0]
@@ -86,7 +86,9 @@ class ColdSteps:
 class MujocoModel(FreeStates):
     """B copies of a MuJoCo model, stepped cold; state: qpos (nq) then qvel (nv), action: the motors' controls (nu)."""
 
-    def __init__(self, model: mujoco.MjModel, num_envs: int, *, substeps: int, num_threads: int | None = None) -> None:
+    def __init__(
+        self, model: "mujoco.MjModel", num_envs: int, *, substeps: int, num_threads: int | None = None
+    ) -> None:
         if model.na:
             raise BadInputError(f"the model has {model.na} actuator states: expected actuators without states")
         # MuJoCo would put a diverging state back to the initial pose, as if the robot had jumped there.
@@ -110,9 +112,11 @@ class MujocoModel(FreeStates):
         return self.state
 
 
-PHYSICS_STATE = int(
-    mujoco.mjtState.mjSTATE_FULLPHYSICS | mujoco.mjtState.mjSTATE_WARMSTART | mujoco.mjtState.mjSTATE_CTRL
-)
+@cache
+def physics_state() -> int:
+    """Return what of MuJoCo's state an episode goes on from."""
+    kinds = mujoco.mjtState
+    return int(kinds.mjSTATE_FULLPHYSICS | kinds.mjSTATE_WARMSTART | kinds.mjSTATE_CTRL)
 
 
 def add_walls(world: ElementTree.Element, maze: Maze, height: float, **attributes: str) -> None:
@@ -124,7 +128,7 @@ def add_walls(world: ElementTree.Element, maze: Maze, height: float, **attribute
         ElementTree.SubElement(world, "geom", {**box, "pos": f"{x} {y} {height / 2}", **attributes})
 
 
-def wall_geoms(model: mujoco.MjModel) -> tuple[int, int] | None:
+def wall_geoms(model: "mujoco.MjModel") -> tuple[int, int] | None:
     """Return the first and last geom id of the maze walls (ids are contiguous), or None on an open plane."""
     walls = [geom for geom in range(model.ngeom) if model.geom(geom).name.startswith("block_")]
     return (walls[0], walls[-1]) if walls else None
@@ -147,12 +151,12 @@ class BatchedPhysics:
 
     def __init__(
         self,
-        model: mujoco.MjModel,
+        model: "mujoco.MjModel",
         num_envs: int,
         *,
         substeps: int,
         watched_geoms: tuple[int, int] | None = None,
-        measure: Callable[[mujoco.MjData], Sequence[float]] | None = None,
+        measure: "Callable[[mujoco.MjData], Sequence[float]] | None" = None,
         num_threads: int | None = None,
     ) -> None:
         """Allocate B copies in the initial state; watch contacts of geoms, first to last; `measure` M numbers each."""
@@ -160,7 +164,7 @@ class BatchedPhysics:
         self.num_threads = min(num_threads or cores(), num_envs)
         self._watched = frozenset(range(watched_geoms[0], watched_geoms[1] + 1) if watched_geoms else ())
         self._measure = measure
-        self.state: Floats = np.zeros((num_envs, mujoco.mj_stateSize(model, PHYSICS_STATE)))  # warm start included
+        self.state: Floats = np.zeros((num_envs, mujoco.mj_stateSize(model, physics_state())))  # warm start included
         self.qpos, self.qvel, _ = np.split(self.state[:, 1:], [model.nq, model.nq + model.nv], axis=1)  # views
         self.touching: Bools = np.zeros(num_envs, dtype=bool)  # a watched geom, at the end of the last step
         self._control: Floats = self.state[:, self.state.shape[1] - model.nu :]
@@ -179,7 +183,7 @@ class BatchedPhysics:
             data.qpos[:] = position
             data.qvel[:] = velocity
             mujoco.mj_forward(self.model, data)
-            mujoco.mj_getState(self.model, data, self._rows[row], PHYSICS_STATE)
+            mujoco.mj_getState(self.model, data, self._rows[row], physics_state())
             if self._measure is not None:
                 self.measured[row] = self._measure(data)
         self.touching[rows] = False
@@ -196,9 +200,9 @@ class BatchedPhysics:
         get_state, set_state, step = mujoco.mj_getState, mujoco.mj_setState, mujoco.mj_step
         for row in rows:
             state = self._rows[row]
-            set_state(model, data, state, PHYSICS_STATE)
+            set_state(model, data, state, physics_state())
             step(model, data, substeps)
-            get_state(model, data, state, PHYSICS_STATE)
+            get_state(model, data, state, physics_state())
             if watched:
                 # Few geoms touch: a set is a third of the time of numpy's comparisons.
                 self.touching[row] = not watched.isdisjoint(data.contact.geom.flat)

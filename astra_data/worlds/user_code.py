@@ -15,11 +15,9 @@ from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any
 
-import torch
-from torch import Tensor
-
 from astra_data.core.durable import file_digest
 from astra_data.core.errors import AstraDataError, BadInputError
+from astra_data.core.lazy import Tensor, torch
 from astra_data.worlds.objective import Objective
 from astra_data.worlds.protocols import AbstractSimulator
 
@@ -230,7 +228,7 @@ def parts_of(learned: object) -> tuple[Mapping[str, Tensor], dict[str, Any]]:
     tensors, metadata = returned
     faults = []
     for name, value in tensors.items():
-        if not isinstance(value, Tensor):
+        if not isinstance(value, torch.Tensor):
             kind = type(value).__name__
             faults.append(f"{name!r} is a {kind}, expected a torch tensor, as torch.as_tensor(value) is")
     for name, value in metadata.items():
@@ -265,8 +263,8 @@ def expect(
     what: str,
     found: object,
     shape: tuple[int, ...],
-    dtype: torch.dtype | None = None,
-    device: torch.device | None = None,
+    dtype: "torch.dtype | None" = None,
+    device: "torch.device | None" = None,
 ) -> Tensor:
     """Return `found`, a finite tensor of `shape`, where -1 stands for any length; refuse what is none."""
     found = expect_tensor(what, found)
@@ -284,7 +282,7 @@ def expect(
 
 def expect_tensor(what: str, found: object) -> Tensor:
     """Return `found`, a tensor; refuse what is none."""
-    if not isinstance(found, Tensor):
+    if not isinstance(found, torch.Tensor):
         raise BadInputError(f"{what}: expected a torch tensor, got a {type(found).__name__}")
     return found
 

@@ -4,11 +4,10 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, ClassVar, Self
 
-import torch
 from pydantic import AfterValidator
-from torch import Tensor
 
 from astra_data.core.config import Config, in_order
+from astra_data.core.lazy import Tensor, torch
 from astra_data.worlds.protocols import TaskSimulator
 
 
@@ -56,7 +55,7 @@ class Variation(Config):
         """Return lower and upper end of every parameter, (P, 2), in the order of `names`."""
         return torch.tensor([getattr(self, name) for name in self.names])
 
-    def draw(self, count: int, device: torch.device | str = "cpu") -> Tensor:
+    def draw(self, count: int, device: "torch.device | str" = "cpu") -> Tensor:
         """Draw the parameters (count, P) of as many episodes, from torch's global generator."""
         low, high = self.ranges().to(device).unbind(-1)
         return low + (high - low) * torch.rand(count, len(low), device=device)

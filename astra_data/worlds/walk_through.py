@@ -4,10 +4,9 @@ import logging
 from collections.abc import Callable
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from astra_data.core.errors import BadInputError
+from astra_data.core.lazy import Tensor, torch
 from astra_data.core.seeding import generator
 from astra_data.worlds.protocols import AbstractSimulator
 from astra_data.worlds.task import RobotEnv, Task

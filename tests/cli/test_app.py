@@ -1,4 +1,5 @@
 import errno
+import json
 import os
 import re
 import shlex
@@ -16,6 +17,7 @@ from typer.testing import CliRunner
 from astra_data.cli import app as cli
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.reader import Dataset
+from astra_data.pipeline.shipped import RECIPES
 
 
 def test_help_loads_none_of_the_large_packages() -> None:
@@ -36,59 +38,94 @@ def test_the_package_runs_as_a_module_does(tmp_path: Path) -> None:
     assert done.returncode == 1 and done.stderr.startswith("error: ") and done.stderr.count("\n") == 1
 
 
-@pytest.mark.parametrize(
-    ("arguments", "told"),
-    [
-        (["run", "nope.toml"], "nope.toml does not exist"),
-        (["run", "quickstart"], "quickstart does not exist: did you mean recipes/quickstart.toml?"),
-        (["check", "a.toml", "b.toml"], "a.toml does not exist"),
-        (["run", "broken.toml"], "broken.toml, line 1"),
-        (["run", "small.toml", "--until", "grund"], "unknown stage 'grund': did you mean 'ground'?"),
-        (["run", "small.toml", "--device", "gpu"], "expected a device such as cpu, cuda or cuda:1, got"),
-        (["pair", "none.toml"], "none.toml does not exist"),
-        (["pair", "none", "--simulator", "antmaze-umaze"], "no dataset 'none' in"),
-        (["pair", "fake", "--simulator", "no.py:SIMULATOR"], "no.py:SIMULATOR: expected a file no.py"),
-        (["collect", "no.py:TASK"], "no.py:TASK: expected a file no.py, found none: write path.py:TASK"),
-        (["check", "no.py:TASK"], "no.py:TASK: expected a file no.py"),
-        (["label", "none", "--task", "antmaze-umaze"], "no dataset 'none' in"),
-        (["label", "fake", "--task", "no.py:TASK"], "no.py:TASK: expected a file no.py"),
-        (["augment", "none"], "no dataset 'none' in"),
-        (["deploy", "none", "--row", "astra"], "none: expected the folder of a run (with recipe.json)"),
-        (["deploy", "runs/car", "--row", "nas"], "with astra-data run: did you mean 'runs/cart'?"),
-        (["deploy", "runs/cart", "--row", "nas", "--out", "fake"], "fake exists already"),
-        (["select", "none"], "none: expected the folder of a run (with recipe.json)"),
-        (["select", "runs/cart", "--field", "3"], "--by-hand, --field and --percent need --trials"),
-        (["view", "none"], "none: expected the folder of a run (with recipe.json)"),
-    ],
-)
-def test_a_mistake_is_told_before_anything_slow_is_loaded(
-    arguments: list[str], told: str, place: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(place)
-    monkeypatch.setitem(sys.modules, "torch", None)
-    found = CliRunner().invoke(cli.app, arguments)
-    assert found.exit_code == 1 and told in str(found.exception)
+MISTAKES = {
+    "run nope.toml": "nope.toml does not exist",
+    "run quickstart": "quickstart does not exist: did you mean recipes/quickstart.toml?",
+    "run broken.toml": "broken.toml, line 1",
+    "run fake": "fake is a dataset: expected the recipe that made it",
+    "run small.toml --until grund": "unknown stage 'grund': did you mean 'ground'?",
+    "run small.toml --device gpu": "expected a device such as cpu, cuda or cuda:1, got",
+    "run small.toml --jobs 0": "Invalid value for '--jobs'",
+    "run small.toml --seed 7": "the recipe has no seed 7; its seeds: 0",
+    "run small.toml --percent 7": "the recipe has no size 7; its sizes: none",
+    "run small.toml --method nsa": "the recipe has no method 'nsa': did you mean 'nas'?",
+    "run small.toml --engine rai": "unknown engine 'rai': did you mean 'ray'?",
+    "run wrong.toml": "task: unknown task 'antmaze-umase': did you mean 'antmaze-umaze'?",
+    "align wrong.toml": "methods: unknown method 'nsa': did you mean 'nas'?",
+    "check wrong.toml": "trian: unknown key: did you mean 'train'?",
+    "train wrong.toml": "ground.updats: unknown key: did you mean 'updates'?",
+    "report wrong.toml": "evaluate.episodes: expected a whole number, got 'many'",
+    "ground wrong.toml": "collect.episodes: expected greater than or equal to 1, got 0",
+    "run based.toml": "based_on: unknown recipe 'smal': did you mean 'small'?",
+    "run data.toml": "data: no dataset 'nowhere' in",
+    "check a.toml b.toml": "a.toml does not exist",
+    "check antmaze-umase": "unknown task 'antmaze-umase': did you mean 'antmaze-umaze'?",
+    "check no.py:TASK": "no.py:TASK: expected a file no.py",
+    "evaluate small.toml --out x": "--out goes with --policy",
+    "evaluate small.toml --policy no.py:P --method nas --seed 0 --out x": "no.py does not exist",
+    "select none": "none: expected the folder of a run (with recipe.json)",
+    "select runs/cart --field 3": "--by-hand, --field and --percent need --trials",
+    "select runs/cart --row nsa": "unknown method 'nsa': did you mean 'nas'?",
+    "deploy none --row astra": "none: expected the folder of a run (with recipe.json)",
+    "deploy runs/car --row nas": "with astra-data run: did you mean 'runs/cart'?",
+    "deploy runs/cart --row nsa": "the run has no row 'nsa': did you mean 'nas'?",
+    "deploy runs/cart --row nas": "expected runs/cart/train/nas/seed_0/policy.safetensors",
+    "deploy runs/cart --row nas --out fake": "fake exists already",
+    "view none": "none: expected the folder of a run (with recipe.json)",
+    "view runs/cart --seed 9": "the recipe has no seed 9; its seeds: 0",
+    "new robot --from nowhere.csv": "nowhere.csv: no such file, folder or dataset",
+    "new fake --from broken.toml": "fake exists already",
+    "recipes copy quikstart": "did you mean 'quickstart'?",
+    "collect antmaze-umase": "unknown task 'antmaze-umase'",
+    "collect no.py:TASK": "no.py:TASK: expected a file no.py, found none: write path.py:TASK",
+    "collect antmaze-umaze --episodes 0": "collect: episodes: expected greater than or equal to 1, got 0",
+    "collect antmaze-umaze --behavior walk": "collect: behavior: expected 'random', 'stress'",
+    "collect antmaze-umaze --out fake": "fake exists already",
+    "pair none.toml": "none.toml does not exist",
+    "pair none --simulator antmaze-umaze": "no dataset 'none' in",
+    "pair fake --simulator antmaze-umase": "unknown task 'antmaze-umase'",
+    "pair fake --simulator no.py:SIMULATOR": "no.py:SIMULATOR: expected a file no.py",
+    "subset fake --percent 50 --out runs": "runs exists already",
+    "label none --task antmaze-umaze": "no dataset 'none' in",
+    "label fake --task antmaze-umase": "unknown task 'antmaze-umase'",
+    "label fake --task no.py:TASK": "no.py:TASK: expected a file no.py",
+    "augment none": "no dataset 'none' in",
+    "augment fake --rotations quater": "rotations: expected 'quarter', 'any' or 'none', got 'quater'",
+    "merge none fake": "no dataset 'none' in",
+    "filter fake": "a filter needs a condition",
+    "trim fake --without v<": "expected a condition such as",
+    "resample none --fps 10": "no dataset 'none' in",
+    "features fake --camera front": "has no camera 'observation.images.front'",
+    "list nowhere": "folders are for --clean",
+    "inspect runs": "runs: found no dataset",
+    "validate runs": "runs: found no dataset",
+    "repair runs --out x": "meta/info.json is missing",
+    "log fake none": "no dataset 'none' in",
+    "import nowhere.csv": "nowhere.csv",
+    "export fake --format d5rl --out x.hdf5": "d5rl",
+    "push none ./shared": "no dataset 'none' in",
+    "push fake ./shared --notes none.toml": "none.toml does not exist",
+    "pull ./nowhere": "nowhere",
+}
+CHECKED = ("quickstart", "cart_sizes", "antmaze_umaze", "ablation", "nao_kick", "humanoid_extended", "fetch_reach")
 
 
-@pytest.mark.parametrize(
-    ("arguments", "told"),
-    [
-        (["run", "small.toml", "--seed", "7"], "the recipe has no seed 7; its seeds: 0"),
-        (["run", "small.toml", "--percent", "7"], "the recipe has no size 7; its sizes: none"),
-        (["run", "small.toml", "--engine", "rai"], "unknown engine 'rai': did you mean 'ray'?"),
-        (["run", "wrong.toml"], "task: unknown task 'antmaze-umase': did you mean 'antmaze-umaze'?"),
-        (["run", "wrong.toml"], "methods: unknown method 'nsa': did you mean 'nas'?"),
-        (["check", "wrong.toml"], "trian: unknown key: did you mean 'train'?"),
-        (["train", "wrong.toml"], "ground.updats: unknown key: did you mean 'updates'?"),
-        (["deploy", "runs/cart", "--row", "nsa"], "the run has no row 'nsa': did you mean 'nas'?"),
-    ],
-)
-def test_a_mistake_in_names_is_told_with_what_comes_close(
-    arguments: list[str], told: str, place: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(place)
-    found = CliRunner().invoke(cli.app, arguments)
-    assert found.exit_code == 1 and told in str(found.exception) and not (place / "runs/small").exists()
+def test_mistakes_and_packaged_recipes_load_nothing_that_takes_seconds(place: Path) -> None:
+    recipes = [f"check {RECIPES / name}.toml" for name in CHECKED]
+    command = [sys.executable, str(Path(__file__).parents[1] / "cold_commands.py")]
+    asked = json.dumps([shlex.split(one) for one in (*MISTAKES, *recipes)])
+    done = subprocess.run(command, input=asked, cwd=place, check=True, capture_output=True, text=True)
+    answered = dict(zip((*MISTAKES, *recipes), json.loads(done.stdout), strict=True))
+    for mistake, told in MISTAKES.items():
+        code, output, loaded = answered[mistake]
+        assert code in (1, 2) and told in re.sub(r"\s+", " ", output), f"{mistake}: {output}"
+        assert loaded == [], mistake
+    for recipe in recipes:
+        code, output, loaded = answered[recipe]
+        assert code == 0 and "items are finished" in output, output
+        # The robots of this one come with gymnasium-robotics.
+        assert loaded == (["mujoco", "gymnasium"] if "fetch" in recipe else []), recipe
+    assert not (place / "runs/small").exists() and not (place / "x").exists()
 
 
 @pytest.fixture(scope="module")
@@ -100,8 +137,13 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "recipes/quickstart.toml").touch()
     (folder / "small.toml").write_text('task = "antmaze-umaze"\nmethods = ["nas", "astra"]\nseeds = [0]\n')
     (folder / "broken.toml").write_text("=")
-    wrong = 'task = "antmaze-umase"\nmethods = ["nsa"]\nseeds = [0]\n[ground]\nupdats = 1\n[trian]\n'
-    (folder / "wrong.toml").write_text(wrong)
+    (folder / "wrong.toml").write_text(
+        'task = "antmaze-umase"\nmethods = ["nsa"]\nseeds = [0]\n[ground]\nupdats = 1\n[trian]\n'
+        '[collect]\nepisodes = 0\n[evaluate]\nepisodes = "many"\n'
+    )
+    for key in ('based_on = "smal"', 'data = "nowhere"'):
+        text = (folder / "small.toml").read_text()
+        (folder / f"{key.partition('_on')[0].partition(' ')[0]}.toml").write_text(text + key)
     (folder / "runs/cart").mkdir(parents=True)
     (folder / "runs/cart/recipe.json").write_text('{"task": "antmaze-umaze", "methods": ["nas"], "seeds": [0]}')
     return folder

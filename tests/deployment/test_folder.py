@@ -132,7 +132,7 @@ def test_of_a_policy_that_cannot_be_written_nothing_is_left(
         (folder / "policy.onnx").touch()
         raise BadInputError("code that cannot be traced")
 
-    monkeypatch.setattr("astra_data.deployment.folder.write_graph", fail)
+    monkeypatch.setattr("astra_data.deployment.graph.write_graph", fail)
     with pytest.raises(BadInputError, match="cannot be traced"):
         deploy(run, "nas", tmp_path / "policy")
     assert list(tmp_path.iterdir()) == []

@@ -45,8 +45,8 @@ def test_a_grounding_of_the_users_own_is_read_once_it_is_known(tmp_path: Path, m
     files.save_grounding(path, Shifted(torch.ones(2)), no_episodes())
     with pytest.raises(BadInputError, match="found kind shifted"):
         files.load_grounding(path)
-    monkeypatch.setitem(files.KINDS, Shifted.kind, Shifted)
-    monkeypatch.setitem(files.KINDS, Lossy.kind, Shifted)
+    monkeypatch.setitem(files.kinds(), Shifted.kind, Shifted)
+    monkeypatch.setitem(files.kinds(), Lossy.kind, Shifted)
     found = files.load_grounding(path)
     assert isinstance(found, Shifted) and found.shift.tolist() == [1.0, 1.0]
     with pytest.raises(BadInputError, match="expected a history model, got a grounding without latents"):
@@ -86,8 +86,8 @@ def test_what_a_grounding_of_one_s_own_saves_and_asks_for_is_checked(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path, shifted = tmp_path / "grounding.safetensors", Shifted(torch.ones(2))
-    monkeypatch.setitem(files.KINDS, Shifted.kind, Shifted)
-    monkeypatch.setitem(files.KINDS, Lossy.kind, Shifted)
+    monkeypatch.setitem(files.kinds(), Shifted.kind, Shifted)
+    monkeypatch.setitem(files.kinds(), Lossy.kind, Shifted)
     monkeypatch.setattr(Shifted, "to_file", lambda self: ({"offset": self.shift.numpy()}, {}))
     with pytest.raises(BadInputError, match=r"^Shifted.to_file: 'offset' is a ndarray, expected a torch"):
         files.save_grounding(path, shifted, no_episodes())
@@ -104,8 +104,8 @@ SHIFTED = Shifted(torch.tensor([0.01]))
 
 @pytest.fixture
 def known(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(files.KINDS, Shifted.kind, Shifted)
-    monkeypatch.setitem(files.KINDS, Lossy.kind, Shifted)
+    monkeypatch.setitem(files.kinds(), Shifted.kind, Shifted)
+    monkeypatch.setitem(files.kinds(), Lossy.kind, Shifted)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,3 @@
-from astra_data.grounding.encoder import HistoryEncoder
 from astra_data.grounding.fit import GroundConfig, HistoryFit
 from astra_data.grounding.model import LossWeights
 from astra_data.methods import METHODS
@@ -26,5 +25,5 @@ def test_the_rows_of_the_ablation_differ_by_one_part_each() -> None:
         assert weights == LossWeights(latent, reward, 1.0)
         assert (method.aligns, method.learn.reward, method.learn.ranges) == (aligns, pays, None)
         whole = {"latent": True, "reward": True, "failures": True, "scatter": True, "printed": False}
-        assert vars(method.fit) == whole | differences | {"encoder": HistoryEncoder}
+        assert vars(method.fit) == whole | differences | {"encoder": None}
         assert method.grounded_as == ("astra" if name == "astra_task_reward" else "")

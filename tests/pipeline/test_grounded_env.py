@@ -26,7 +26,7 @@ from astra_data.pipeline.plan import plan
 from astra_data.pipeline.stages.evaluate import EvaluateConfig, evaluate
 from astra_data.pipeline.trained_policy import load_policy, settings_of
 from astra_data.policies.gymnasium import Array, BatchedVectorEnv, SingleEnv
-from astra_data.policies.running_policy import UserPolicy
+from astra_data.policies.networks import UserPolicy
 from astra_data.policies.simulator_env import SimulatorEnv
 from astra_data.policies.train import InSimulator
 from astra_data.worlds.user_code import user_object

@@ -27,8 +27,8 @@ from astra_data.policies.episodes import (
     reached_in_own_world,
     started,
 )
-from astra_data.policies.networks import ActorCritic, ActorCriticShape
-from astra_data.policies.running_policy import Observed, PolicyFile, RunningPolicy, UserPolicy, running
+from astra_data.policies.networks import ActorCritic, ActorCriticShape, UserPolicy
+from astra_data.policies.running_policy import Observed, PolicyFile, RunningPolicy, running
 from astra_data.policies.simulator_env import Simulation, SimulatorEnv, WorldConfig, training_env
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.commands import Commands

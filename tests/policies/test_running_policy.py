@@ -15,8 +15,9 @@ from astra_data.grounding.alignment import TargetEncoder
 from astra_data.grounding.files import save_grounding
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.model import GroundingModel, GroundingShape
-from astra_data.policies.networks import ActorCritic, ActorCriticShape, AdaptiveShape, Student
-from astra_data.policies.running_policy import KINDS, Array, PolicyFile, RunningPolicy, Shown, UserPolicy
+from astra_data.policies.learner import KINDS
+from astra_data.policies.networks import ActorCritic, ActorCriticShape, AdaptiveShape, Student, UserPolicy
+from astra_data.policies.running_policy import Array, PolicyFile, RunningPolicy, Shown
 from astra_data.policies.simulator_env import Simulation, WorldConfig, policy_observation
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.variation import PlanarVariation

@@ -18,7 +18,9 @@ from astra_data.core.seeding import derive
 from astra_data.deployment.graph import write_graph
 from astra_data.grounding.simulator import NO_GROUNDING
 from astra_data.policies.gymnasium import WatchedEnv
-from astra_data.policies.running_policy import KINDS, PolicyFile, UserPolicy, add_policy_kind, running
+from astra_data.policies.learner import KINDS, add_policy_kind
+from astra_data.policies.networks import UserPolicy
+from astra_data.policies.running_policy import PolicyFile, running
 from astra_data.policies.train import PpoTrainConfig, Training, UserLearner, with_restarts
 from astra_data.worlds.task import Task
 

@@ -21,7 +21,6 @@ from astra_data.dataset.inspection import visited
 from astra_data.dataset.reader import Dataset
 from astra_data.io.hub.stores import HubStore, parse_source
 from astra_data.reports.blocks import table
-from astra_data.reports.figures.style import coverage, png
 
 TAGS = ("LeRobot", "robotics", "abstract-sim2real", "astra-data")
 
@@ -53,6 +52,8 @@ def write_card(dataset: Dataset, out: Path, notes: Notes, *, source: str | None 
     write_file(out, text)
     if positions is None or figure is None:
         return [out]
+    from astra_data.reports.figures.style import coverage, png  # noqa: PLC0415 - slow
+
     write_file(figure, png(coverage(positions.counts, positions.extent, "position", "m")))
     return [out, figure]
 

@@ -2,26 +2,27 @@
 
 import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import torch
 from pydantic import Field, field_validator
-from torch import Tensor
 
 from astra_data.core.artifact import CHECKPOINT, finished_folder
 from astra_data.core.config import NotNegative, as_json
 from astra_data.core.durable import file_digest
+from astra_data.core.lazy import Tensor, torch, without_gradients
 from astra_data.core.progress import Progress, silent
 from astra_data.core.provenance import origin
 from astra_data.core.seeding import derive
 from astra_data.dataset.versions import open_dataset
-from astra_data.grounding.alignment import TargetEncoder, gaussian_mmd, unit_vectors
 from astra_data.grounding.descent import Descent, WindowedConfig
 from astra_data.grounding.features import MADE_BY
 from astra_data.grounding.files import GROUNDING, TARGET_ENCODER, load_history_model, save_target_encoder
-from astra_data.grounding.model import GroundingModel
 from astra_data.grounding.paired_episodes import PairedEpisodes, PairedWindows
 from astra_data.reports.artifacts import METRICS
+
+if TYPE_CHECKING:
+    from astra_data.grounding.alignment import TargetEncoder
+    from astra_data.grounding.model import GroundingModel
 
 _MEASURED_EVERY = 100
 _BANDWIDTHS = (0.25, 0.5, 1.0, 2.0)  # of the MMD's kernels, in units of the square root of the latent's size
@@ -70,6 +71,8 @@ def align(
         >>> ground("antmaze-umaze", "astra", GroundConfig(updates=2), dataset="pairs", out=Path("astra"))
         >>> align(AlignConfig(updates=2), dataset="pairs", grounding=Path("astra"), out=Path("encoder"))
     """
+    from astra_data.grounding.alignment import TargetEncoder, unit_vectors
+
     made = origin(device)
     grounding_file = grounding / GROUNDING
     model = load_history_model(grounding_file, device)
@@ -136,9 +139,11 @@ def align(
 
 
 def _losses(
-    model: GroundingModel, encoder: TargetEncoder, windows: PairedWindows, state: Tensor, bandwidths: Tensor
+    model: "GroundingModel", encoder: "TargetEncoder", windows: PairedWindows, state: Tensor, bandwidths: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return the mean MMD² between p^s_i and p^t_i, and the mean squared distance of paired latents."""
+    from astra_data.grounding.alignment import gaussian_mmd
+
     with torch.no_grad():
         source, _ = model.encode(windows)
         source_mean, source_log_variance = model.predict_latent(source, windows.action)
@@ -150,9 +155,9 @@ def _losses(
     return (discrepancy * windows.mask).sum() / total, (distance * windows.mask).sum() / total
 
 
-@torch.no_grad()
+@without_gradients
 def _agreement(
-    model: GroundingModel, encoder: TargetEncoder, episodes: PairedEpisodes, bandwidths: Tensor
+    model: "GroundingModel", encoder: "TargetEncoder", episodes: PairedEpisodes, bandwidths: Tensor
 ) -> dict[str, float]:
     discrepancy, distance = _losses(model, encoder, episodes.windows, episodes.target_state, bandwidths)
     latent, _ = model.encode(episodes.windows)
@@ -164,7 +169,7 @@ def _agreement(
     return found
 
 
-def _estimate_error(encoder: TargetEncoder, windows: PairedWindows, state: Tensor) -> Tensor:
+def _estimate_error(encoder: "TargetEncoder", windows: PairedWindows, state: Tensor) -> Tensor:
     """Return the mean squared error (X,) of the estimated φ(s_i), in units of its variance."""
     _, memory = encoder.estimator.sequence(encoder.encoder_input(state, windows.goal, windows.previous_action))
     squared = ((encoder.estimates(memory) - windows.state) / encoder.abstract_std).square()

@@ -19,13 +19,13 @@ from pathlib import Path
 from typing import Annotated, Literal, Self
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from astra_data.core.arrays import Bools
 from astra_data.core.config import AtOnce, Config, Count, NotNegative
 from astra_data.core.errors import BadInputError
+from astra_data.core.lazy import torch
 from astra_data.core.progress import Progress, silent
 from astra_data.core.seeding import derive, generator, held_out_episodes
 from astra_data.dataset import columns as names

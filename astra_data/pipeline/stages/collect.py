@@ -7,16 +7,15 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, model_validator
-from torch import Tensor
 
 from astra_data.core.arrays import Floats, Ints, as_column
 from astra_data.core.checkpoint import Logbook
 from astra_data.core.config import Config, Count, NotNegative, Share, in_order
 from astra_data.core.durable import file_digest
 from astra_data.core.errors import BadInputError
+from astra_data.core.lazy import Tensor, torch
 from astra_data.core.progress import Progress, Stopwatch, part, silent
 from astra_data.core.seeding import derive, generator
 from astra_data.dataset import columns as names
@@ -26,7 +25,6 @@ from astra_data.dataset.versions import home_of
 from astra_data.dataset.writer import StagedWriter
 from astra_data.grounding.files import GROUNDING, TARGET_ENCODER, grounding_at, load_target_encoder
 from astra_data.policies.episodes import ObservedTargetEnv
-from astra_data.policies.networks import ActorCritic, ActorCriticShape, PolicyShape, SoftActor
 from astra_data.policies.ppo import Ppo, PpoConfig
 from astra_data.policies.running_policy import POLICY, Observed, PolicyFile, RunningPolicy, running
 from astra_data.policies.sac import Sac, SacConfig
@@ -224,6 +222,8 @@ def suboptimal_by_ppo(
     task: Task, *, steps: int, seed: int, folder: Path, num_threads: int | None, progress: Progress
 ) -> tuple[PolicyFile, Metadata]:
     """Train a policy without memory on φ of the target's state, for `steps`; resume from a checkpoint in `folder`."""
+    from astra_data.policies.networks import ActorCritic, ActorCriticShape
+
     torch.manual_seed(derive(seed, "suboptimal policy"))
     world = ObservedTargetEnv(task, _PPO_ENVS, num_threads=num_threads)
     policy = ActorCritic(ActorCriticShape(world.observation_size, world.action_size))
@@ -236,6 +236,8 @@ def suboptimal_by_sac(
     task: Task, *, steps: int, episode_steps: int, seed: int, folder: Path, num_threads: int | None, progress: Progress
 ) -> tuple[PolicyFile, Metadata]:
     """Train one on the full state, until episodes last `episode_steps` on average, or for `steps`."""
+    from astra_data.policies.networks import PolicyShape, SoftActor
+
     if not task.objective.is_lasting:
         raise BadInputError(f"in {task.name} good episodes are short: use 'suboptimal_ppo'")
     torch.manual_seed(derive(seed, "suboptimal policy"))

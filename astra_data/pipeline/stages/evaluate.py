@@ -8,13 +8,12 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from torch import Tensor
-
 from astra_data.core.artifact import check_made_from, finished_folder, refuse_finished
 from astra_data.core.checkpoint import save_tensors
 from astra_data.core.config import AtOnce, Config, Positive
 from astra_data.core.durable import file_digest
 from astra_data.core.errors import BadInputError
+from astra_data.core.lazy import Tensor
 from astra_data.core.progress import Progress, Stopwatch, silent
 from astra_data.core.provenance import origin
 from astra_data.core.seeding import derive
@@ -23,7 +22,7 @@ from astra_data.grounding.simulator import NO_GROUNDING, Grounding
 from astra_data.methods import method_named
 from astra_data.methods.follower import careful
 from astra_data.policies.episodes import Act, Begin, RecordedRange, in_simulator, in_target, started
-from astra_data.policies.running_policy import POLICY, EncoderKind, PolicyFile, UserPolicy, running
+from astra_data.policies.running_policy import POLICY, EncoderKind, PolicyFile, running
 from astra_data.policies.simulator_env import SimulatorEnv, training_env
 from astra_data.reports.artifacts import EVALUATION, TRAJECTORIES
 from astra_data.robots.registry import task_named
@@ -168,6 +167,8 @@ class _Row:
 
 
 def _policy(task: Task, loaded: PolicyFile | None, files: Mapping[str, Path], config: EvaluateConfig) -> _Row:
+    from astra_data.policies.networks import UserPolicy
+
     trained = loaded or PolicyFile.load(files["policy"])
     grounding = grounding_at(files.get("grounding"))
     source = running(task, trained, grounding)

@@ -4,12 +4,11 @@ import logging
 from pathlib import Path
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from astra_data.core.arrays import as_column, as_rows
 from astra_data.core.durable import make_folder, refuse_existing
 from astra_data.core.errors import BadInputError
+from astra_data.core.lazy import Tensor, torch
 from astra_data.core.progress import Progress, silent
 from astra_data.core.seeding import generator
 from astra_data.dataset import columns as names

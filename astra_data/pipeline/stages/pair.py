@@ -6,11 +6,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from astra_data.core.arrays import as_column, as_rows
 from astra_data.core.config import Config, NotNegative
 from astra_data.core.errors import BadInputError
+from astra_data.core.lazy import torch
 from astra_data.core.progress import Progress, Stopwatch, silent
 from astra_data.dataset import columns as keys
 from astra_data.dataset.checkup import LARGEST, TURNS, is_angle

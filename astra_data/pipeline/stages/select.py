@@ -6,13 +6,11 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
-import torch
-from torch import Tensor
-
 from astra_data.core.artifact import check_made_from, finished_folder
 from astra_data.core.config import AtOnce, Config
 from astra_data.core.durable import file_digest, write_file
 from astra_data.core.errors import BadInputError
+from astra_data.core.lazy import Tensor, torch
 from astra_data.core.naming import artifact_key, reference_of
 from astra_data.core.progress import Progress, Stopwatch, silent
 from astra_data.core.provenance import origin

@@ -6,15 +6,12 @@ from functools import partial
 from importlib.resources import files
 from pathlib import Path
 
-import mujoco
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from safetensors.torch import load_file
-from torch import Tensor
-from torch.nn import functional
 
 from astra_data.core.arrays import Floats
+from astra_data.core.checkpoint import load_tensors
+from astra_data.core.lazy import Tensor, mujoco, torch
 from astra_data.dataset.columns import ABSTRACT_STATE, ACTION, GOAL, STATE
 from astra_data.worlds.geometry import rotation_matrix
 from astra_data.worlds.plane.mazes import LONG_MAZE, U_MAZE, Maze
@@ -40,7 +37,7 @@ WALL_HEIGHT = 0.5  # in units of the maze scale, as in gymnasium-robotics
 _ANKLE_SIGNS = np.array([1.0, -1.0, -1.0, 1.0])
 
 
-def ant_model(maze: Maze | None = None, *, leg_scale: float = 1.0) -> mujoco.MjModel:
+def ant_model(maze: Maze | None = None, *, leg_scale: float = 1.0) -> "mujoco.MjModel":
     """Build Gymnasium's ant, in a `maze` as gymnasium-robotics has it or on a plane; `leg_scale` lengthens its legs."""
     root = ElementTree.parse(Path(str(files("gymnasium.envs.mujoco") / "assets" / "ant.xml"))).getroot()
     root.findall("option")[0].set("integrator", INTEGRATOR)
@@ -125,7 +122,7 @@ class VelocityController:
     def load(cls, path: Path | None = None) -> "VelocityController":
         """Load weights from `path`, by default the checkpoint shipped with the package."""
         source = path or Path(str(files("astra_data.robots.ant") / "velocity_controller.safetensors"))
-        tensors = load_file(source)
+        tensors, _ = load_tensors(source)
         layers = [(tensors[f"{layer}.weight"], tensors[f"{layer}.bias"]) for layer in range(len(tensors) // 2)]
         return cls(layers, float(tensors["torque_scale"]))
 
@@ -134,8 +131,8 @@ class VelocityController:
         observation, quarters = canonical_view(qpos, qvel, command)
         hidden = torch.from_numpy(observation).float()
         for weight, bias in self._layers[:-1]:
-            hidden = functional.linear(hidden, weight, bias).relu()
-        squashed = functional.linear(hidden, *self._layers[-1]).tanh()
+            hidden = torch.nn.functional.linear(hidden, weight, bias).relu()
+        squashed = torch.nn.functional.linear(hidden, *self._layers[-1]).tanh()
         return torques_to_body(self.torque_scale * squashed.double().numpy(), quarters)
 
 

@@ -7,15 +7,12 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-import mujoco
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
-from torch.nn import functional
 
 from astra_data.core.arrays import Bools, Floats, normalized
 from astra_data.core.errors import BadInputError
+from astra_data.core.lazy import Tensor, mujoco, torch
 from astra_data.worlds.geometry import rotation
 from astra_data.worlds.protocols import Step, rows_in
 from astra_data.worlds.simulators import BatchedPhysics, PhysicsTarget
@@ -47,7 +44,7 @@ CONTACT_M = 0.002  # a foot touches the floor when its sole is closer: the sum o
 Actuators = Literal["positions", "motors"]
 
 
-def humanoid_model(actuators: Actuators = "positions") -> mujoco.MjModel:
+def humanoid_model(actuators: Actuators = "positions") -> "mujoco.MjModel":
     """Load Gymnasium's humanoid; with "positions" MuJoCo holds joint angles in rad, up to the motors' torques."""
     path = Path(str(files("gymnasium.envs.mujoco") / "assets" / "humanoid.xml"))
     model = mujoco.MjModel.from_xml_path(str(path))
@@ -175,7 +172,7 @@ class HumanoidEnv(PhysicsTarget):
         self.wall_contact = torch.zeros(num_envs, dtype=torch.bool)  # there are no walls
         self.reseed(seed)
 
-    def _measure(self, data: mujoco.MjData) -> tuple[float, float, float]:
+    def _measure(self, data: "mujoco.MjData") -> tuple[float, float, float]:
         """Return x of the center of mass, the sums of squared controls and contact forces, of the last evaluation."""
         mujoco.mj_rnePostConstraint(self._model, data)
         control = data.actuator_force / self._torque_per_control
@@ -245,7 +242,7 @@ class _Skeleton(NamedTuple):
 
 
 @cache
-def _skeleton(dtype: torch.dtype, device: torch.device) -> _Skeleton:
+def _skeleton(dtype: "torch.dtype", device: "torch.device") -> _Skeleton:
     model = humanoid_model()
     bodies = range(_TORSO, model.nbody)
 
@@ -343,7 +340,7 @@ class Phi:
 
     def __call__[Array: (NDArray[np.float32], Floats, Tensor)](self, state: Array) -> Array:
         """Return φ of states (..., 47)."""
-        if isinstance(state, Tensor):
+        if isinstance(state, torch.Tensor):
             return self._of_tensors(state)
         return self._of_tensors(torch.from_numpy(state)).numpy()
 
@@ -419,7 +416,7 @@ def beyond_extended_kinematics(state: Tensor) -> Tensor:
 
 def _heading(turn: Tensor) -> Tensor:
     """Return the headings of torsos with rotations (..., 3, 3), as cosine and sine (..., 2)."""
-    return functional.normalize(turn[..., :2, 0], dim=-1)
+    return torch.nn.functional.normalize(turn[..., :2, 0], dim=-1)
 
 
 def _headed(turn: Tensor, vector: Tensor) -> Tensor:

@@ -9,15 +9,12 @@ from functools import cached_property
 from importlib.resources import files
 from typing import Any, ClassVar
 
-import mujoco
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
-from torch.nn import functional
 
 from astra_data.core.arrays import Floats, normalized
 from astra_data.core.errors import BadInputError
+from astra_data.core.lazy import Tensor, mujoco, torch
 from astra_data.dataset.columns import ABSTRACT_STATE, ACTION, STATE
 from astra_data.robots.humanoid import target as humanoid
 from astra_data.worlds.objective import Objective
@@ -26,7 +23,7 @@ from astra_data.worlds.task import Task, Varied, column, entries, free_body
 from astra_data.worlds.variation import JointVariation, VariedSimulator, noisy_command
 
 
-def walker_model() -> mujoco.MjModel:
+def walker_model() -> "mujoco.MjModel":
     """Build the walker; qpos (7): x, z and pitch of the torso, left hip, left knee, right hip, right knee."""
     return mujoco.MjModel.from_xml_path(str(files("astra_data.robots.humanoid") / "walker2d.xml"))
 
@@ -209,7 +206,7 @@ class HumanoidExtendedKinematics(HumanoidKinematics):
         shift = torch.cat([aside[:, :2], velocity[:, 2:] * self._timestep_s], dim=-1)
         spin = (1.0 - share) * self.state[:, _SPIN]
         up = self.state[:, _UP]
-        up = functional.normalize(up - self._timestep_s * torch.linalg.cross(spin, up), dim=-1)
+        up = torch.nn.functional.normalize(up - self._timestep_s * torch.linalg.cross(spin, up), dim=-1)
         return torch.cat([joints, self.state[:, _CENTER] + shift, velocity, up, spin], dim=-1)
 
 

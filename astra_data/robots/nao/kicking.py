@@ -5,12 +5,10 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-import torch
-from torch import Tensor
-from torch.nn.functional import normalize
 
 from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError
+from astra_data.core.lazy import Tensor, torch
 from astra_data.worlds.geometry import turned
 from astra_data.worlds.plane.mazes import Maze
 from astra_data.worlds.plane.navigation import PlanarObjective
@@ -147,7 +145,7 @@ class BallAgent(PlanarStates):
         speed = moved[:, 6:].norm(dim=-1, keepdim=True)
         lay = velocity.norm(dim=-1, keepdim=True) <= _LIES_M_S
         turn_rad = _TURN_RAD * torch.randn(self.num_envs, device=ball.device)
-        direction = normalize(torch.where(lay, turned(own, turn_rad), velocity))
+        direction = torch.nn.functional.normalize(torch.where(lay, turned(own, turn_rad), velocity))
         slowed_m_s = self._deceleration_m_s2 * self.period_s
         leaving = (speed + slowed_m_s).clamp_min(_LEAVES_M_S * lay)
         rolled = torch.cat(roll(ball, direction * leaving, self.period_s, self._deceleration_m_s2), dim=-1)

@@ -10,17 +10,17 @@ from math import atan2
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from astra_data.core.arrays import Bools, Floats
+from astra_data.core.lazy import mujoco
 from astra_data.core.provenance import cores
 from astra_data.robots.nao import walk
 from astra_data.robots.nao.kicking import BALL_RADIUS_M
 from astra_data.worlds.geometry import rotation_matrix
 from astra_data.worlds.plane.mazes import Maze
-from astra_data.worlds.simulators import PHYSICS_STATE, BatchedPhysics, add_walls, share_out, wall_geoms
+from astra_data.worlds.simulators import BatchedPhysics, add_walls, physics_state, share_out, wall_geoms
 
 SUBSTEPS = 3  # physics steps per tick: 4 ms each
 WALL_HEIGHT_M = 0.5
@@ -34,7 +34,7 @@ _BALL = 7 + MOTORS
 _MIDDLE_M = 0.03  # either foot may kick a ball that is less far to the side: the torso sways as far from step to step
 
 
-def nao_model(maze: Maze | None = None, *, ball: bool = False) -> mujoco.MjModel:
+def nao_model(maze: Maze | None = None, *, ball: bool = False) -> "mujoco.MjModel":
     """Build a NAO, see nao.xml; qpos: torso (7), left leg (6), right leg (6), ball (7); controls: the legs' angles."""
     root = ElementTree.parse(Path(str(files("astra_data.robots.nao") / "nao.xml"))).getroot()
     (world,) = root.findall("worldbody")
@@ -50,7 +50,7 @@ class BatchedBodies(BatchedPhysics):
 
     def __init__(
         self,
-        model: mujoco.MjModel,
+        model: "mujoco.MjModel",
         traits: walk.Traits,
         *,
         longest_delay_ticks: int,
@@ -100,12 +100,14 @@ class BatchedBodies(BatchedPhysics):
             model.geom_friction[floor, 0] = traits.friction[row]
             stiffness = self._stiffness * traits.stiffness[row]
             model.actuator_gainprm[:, 0], model.actuator_biasprm[:, 1] = stiffness, -stiffness
-            mujoco.mj_setState(model, data, self.state[row], PHYSICS_STATE)
+            mujoco.mj_setState(model, data, self.state[row], physics_state())
             followed[row] = self._walk(model, data, row, targets, noise[row])
-            mujoco.mj_getState(model, data, self.state[row], PHYSICS_STATE)
+            mujoco.mj_getState(model, data, self.state[row], physics_state())
             self.pressure[row] = data.sensordata
 
-    def _walk(self, model: mujoco.MjModel, data: mujoco.MjData, row: int, targets: walk.Targets, noise: Floats) -> int:
+    def _walk(
+        self, model: "mujoco.MjModel", data: "mujoco.MjData", row: int, targets: walk.Targets, noise: Floats
+    ) -> int:
         style, sent, rates, step = self.style, self.sent[row], data.qvel[3:6], mujoco.mj_step
         planned = (targets.angles[row] + self.traits.joint_offset_rad[row])[:, walk.TO_MOTORS]
         supports, lifts_off = targets.supports[row].tolist(), targets.lifts_off[row].tolist()
@@ -145,7 +147,7 @@ class BatchedBodies(BatchedPhysics):
         self.gyro[row] = measured
         return followed
 
-    def _touches(self, data: mujoco.MjData) -> bool:
+    def _touches(self, data: "mujoco.MjData") -> bool:
         """Return whether the robot, not the ball, touches a wall."""
         first, last = self._walls or (0, -1)
         geoms = data.contact.geom

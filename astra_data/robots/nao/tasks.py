@@ -6,11 +6,10 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from astra_data.core.arrays import Bools, Floats
+from astra_data.core.lazy import Tensor, torch
 from astra_data.dataset.columns import ABSTRACT_STATE, ACTION, GOAL, STATE
 from astra_data.robots.nao.kicking import BallAgent, Kicking, asks_to_kick
 from astra_data.robots.nao.robot import CONTROL_STEP_S, BatchedNao

@@ -4,13 +4,11 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
-import scipy
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from astra_data.core.arrays import Bools, Floats
 from astra_data.core.errors import BadInputError
+from astra_data.core.lazy import Tensor, scipy, torch
 
 
 @dataclass(frozen=True)
@@ -197,7 +195,7 @@ class GoalDistance:
         half_extent = torch.tensor(maze.half_extent, dtype=torch.float32)
         return cls(torch.from_numpy(fields).float(), torch.from_numpy(lattice).float(), half_extent, maze.fine_m)
 
-    def to(self, device: str | torch.device) -> "GoalDistance":
+    def to(self, device: "str | torch.device") -> "GoalDistance":
         """Return the same fields on `device`."""
         tensors = (self.fields.to(device), self.lattice.to(device), self.half_extent.to(device))
         return GoalDistance(*tensors, self.cell_m)

@@ -5,12 +5,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from astra_data.core.arrays import Bools, Floats
 from astra_data.core.errors import BadInputError
+from astra_data.core.lazy import Tensor, torch
 from astra_data.worlds.objective import Objective
 from astra_data.worlds.plane.mazes import GoalDistance, Maze
 from astra_data.worlds.protocols import Step
@@ -72,7 +71,7 @@ class Navigation(PlanarObjective):
         return GoalDistance.of_maze(self.maze, spacing_m=self.spread_m, radius_m=self.path_clearance_m)
 
     @cached_property
-    def _goal_distances(self) -> dict[torch.device, GoalDistance]:
+    def _goal_distances(self) -> "dict[torch.device, GoalDistance]":
         return {}
 
     def draw_starts(self, rng: np.random.Generator, count: int) -> Floats:

@@ -2,10 +2,8 @@
 
 from collections.abc import Mapping
 
-import torch
-from torch import Tensor
-
 from astra_data.core.errors import BadInputError
+from astra_data.core.lazy import Tensor, torch
 from astra_data.worlds.geometry import turned
 from astra_data.worlds.plane.mazes import FreeSpace, Maze
 from astra_data.worlds.protocols import TaskSimulator

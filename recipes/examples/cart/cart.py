@@ -1,9 +1,9 @@
 """A cart with a payload that tips: the task, and a kinematic unicycle as its abstract simulator."""
 
 import numpy as np
-import torch
 
 from astra_data import Column, Objective, Task
+from astra_data.core.lazy import torch
 
 TIMESTEP_S = 0.1
 DOCK_M = (3.0, 0.0)

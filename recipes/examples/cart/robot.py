@@ -10,10 +10,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import torch
 from cart import DOCK_M, TASK
 
 from astra_data import load_policy
+from astra_data.core.lazy import torch
 
 TIPPED_RAD = 0.6
 

@@ -3,10 +3,10 @@
 from functools import partial
 
 import numpy as np
-import torch
 from fetch import STEP_M, TIMESTEP_S
 
 from astra_data import Column, Objective, Task
+from astra_data.core.lazy import torch
 from astra_data.worlds.gymnasium_env import GymnasiumRobot
 
 AXES = {"names": ("x", "y", "z"), "astra": {"unit": ["m"] * 3}}

@@ -1,8 +1,8 @@
 """A pusher written by hand, as a row: what the arm can reach, by a policy that learned nothing."""
 
 import numpy as np
-import torch
 
+from astra_data.core.lazy import torch
 from astra_data.methods.method import Method
 from astra_data.policies.train import UserLearner
 
