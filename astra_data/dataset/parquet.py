@@ -16,7 +16,7 @@ from astra_data.dataset.format import CHUNK_SIZE, COMPRESSIONS, DATA_FILE_SIZE_M
 FILE_SIZE_LIMIT = DATA_FILE_SIZE_MB * 2**20
 UNREADABLE = (OSError, ValueError, pa.ArrowException)  # of damaged files; ValueError: names are not valid UTF-8
 GROUP_ROWS = 2**12  # upper bound of the rows of a row group of several episodes: the footer names all its columns
-BLOCK_ROWS = 2**16  # rows read at once, rounded up to whole row groups
+BLOCK_ROWS = 2**14  # rows read at once, rounded up to whole row groups
 BLOCK_VALUES = 2**23  # values of arrays that are read at once, where that is fewer rows; rounded up, too
 
 

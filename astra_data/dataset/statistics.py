@@ -21,7 +21,7 @@ from astra_data.dataset.format import (
 from astra_data.dataset.parquet import RotatingWriter, read_arrays, to_arrow, to_lists
 from astra_data.dataset.plain import PlainColumn
 
-BLOCK_BYTES = 192 * 2**20  # of values held in memory at once, unless those of one index are more
+BLOCK_BYTES = 2**27  # of values held in memory at once, unless those of one index are more
 _PART = 2**18  # rows that are centered at once
 ROWS_AT_ONCE = 1000  # rows held in memory before they are written
 
