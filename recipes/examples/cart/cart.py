@@ -3,7 +3,7 @@
 import numpy as np
 
 from astra_data import Column, Objective, Task
-from astra_data.core.lazy import torch
+from astra_data.core.lazy import torch  # loads with its first use: `check` answers without it
 
 TIMESTEP_S = 0.1
 DOCK_M = (3.0, 0.0)

@@ -13,7 +13,7 @@ import numpy as np
 from cart import DOCK_M, TASK
 
 from astra_data import load_policy
-from astra_data.core.lazy import torch
+from astra_data.core.lazy import torch  # loads with its first use: `check` answers without it
 
 TIPPED_RAD = 0.6
 

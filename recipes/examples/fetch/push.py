@@ -6,7 +6,7 @@ import numpy as np
 from fetch import STEP_M, TIMESTEP_S
 
 from astra_data import Column, Objective, Task
-from astra_data.core.lazy import torch
+from astra_data.core.lazy import torch  # loads with its first use: `check` answers without it
 from astra_data.worlds.gymnasium_env import GymnasiumRobot
 
 CONTACT_M = 0.045  # from the gripper's axis to the puck's

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from astra_data.core.lazy import torch
+from astra_data.core.lazy import torch  # loads with its first use: `check` answers without it
 from astra_data.methods.method import Method
 from astra_data.policies.train import UserLearner
 
