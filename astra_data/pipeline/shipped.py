@@ -9,7 +9,6 @@ from pathlib import Path
 
 from astra_data.core.config import did_you_mean
 from astra_data.core.errors import BadInputError
-from astra_data.worlds.user_code import code_digest
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 
@@ -120,6 +119,8 @@ def whereabouts(name: str) -> str:
 
 def is_shipped(place: str) -> bool:
     """Return whether the task at a `place`, such as cart.py:TASK, is that of a recipe or a copy of it."""
+    from astra_data.worlds.user_code import code_digest
+
     tasks = {str(RECIPES / recipe.path.parent / recipe.task) for recipe in shipped_recipes()}
     alike = [task for task in tasks if Path(task).name == Path(place).name]
     return any(code_digest(task) == code_digest(place) for task in alike)
