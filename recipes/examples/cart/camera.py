@@ -43,7 +43,7 @@ def photograph(states):
 
 
 def record(folder, drives=60, seconds=15, seed=0):
-    """Drive by random commands, each held for 0.1 to 2 s, until the payload tips."""
+    """Drive from anywhere in the picture by random commands, each held for 0.1 to 2 s, until the payload tips."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset  # noqa: PLC0415 - slow, and not needed to play
 
     names = {"observation.state": TASK.state.names, "action": TASK.action.names, "next.terminated": ("tipped",)}
@@ -55,7 +55,9 @@ def record(folder, drives=60, seconds=15, seed=0):
     dataset, rng = LeRobotDataset.create("cart/camera", 10, features, root=folder), np.random.default_rng(seed)
     for _ in range(drives):
         cart = TrueCart()
-        state, tipped, left = cart.reset(int(rng.integers(2**32))), False, 0
+        cart.reset(int(rng.integers(2**32)))
+        cart.x, cart.y = rng.uniform([-1.5, -3.0], [4.5, 3.0])
+        state, tipped, left = cart.state(), False, 0
         for _ in range(10 * seconds):
             if left == 0:
                 command, left = rng.uniform([-0.2, -1.5], [1.0, 1.5]).astype(np.float32), rng.integers(1, 21)
