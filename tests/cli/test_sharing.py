@@ -61,7 +61,7 @@ def test_bad_files_are_left_out_by_an_option(tmp_path: Path) -> None:
 @pytest.fixture
 def fake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Dataset:
     monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path / "home"))
-    monkeypatch.setattr("astra_data.io.hub.card.png", lambda figure: b"\x89PNG")
+    monkeypatch.setattr("astra_data.reports.figures.style.png", lambda figure: b"\x89PNG")
     monkeypatch.chdir(tmp_path)
     return write_fake(tmp_path / "fake")
 

@@ -238,9 +238,9 @@ def test_a_fit_takes_it_from_its_training_episodes_but_as_printed_and_where_touc
         seen.extend(one for one in others if isinstance(one, PairedEpisodes))
         return None, None
 
-    monkeypatch.setattr("astra_data.grounding.fit.fit_failures", noted)
-    monkeypatch.setattr("astra_data.grounding.fit.failure_figures", noted)
-    monkeypatch.setattr("astra_data.grounding.fit.has_failures", lambda *_: True)
+    monkeypatch.setattr("astra_data.grounding.failures.fit_failures", noted)
+    monkeypatch.setattr("astra_data.grounding.failures.failure_figures", noted)
+    monkeypatch.setattr("astra_data.grounding.failures.has_failures", lambda *_: True)
     training, held_out = recorded(*[1.0] * 10), recorded(*[0.5] * 10)
     config = GroundConfig(updates=1, batch_windows=1, window=2, latent_size=8)
     fitting = Fitting(task, config, None, training, held_out, 0, "cpu", tmp_path, silent)

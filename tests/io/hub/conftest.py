@@ -16,7 +16,7 @@ def fake(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 @pytest.fixture
 def quick_figure(monkeypatch: pytest.MonkeyPatch) -> None:
     """Draw no figures: it is what takes longest."""
-    monkeypatch.setattr("astra_data.io.hub.card.png", lambda figure: b"\x89PNG")
+    monkeypatch.setattr("astra_data.reports.figures.style.png", lambda figure: b"\x89PNG")
 
 
 @pytest.fixture
