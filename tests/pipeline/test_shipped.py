@@ -8,6 +8,7 @@ from astra_data.cli.app import app
 from astra_data.core.errors import BadInputError
 from astra_data.pipeline.experiment import load_experiment
 from astra_data.pipeline.shipped import RECIPES, copy_recipe, shipped, shipped_recipes
+from astra_data.reports.results import merge, read_results
 
 
 def recipes_of_the_repository() -> set[str]:
@@ -71,3 +72,12 @@ def test_the_command_line_lists_and_copies(tmp_path: Path) -> None:
     copied = CliRunner().invoke(app, ["recipes", "copy", "quickstart", str(tmp_path)])
     assert copied.output == f"finished: 4 files; astra-data run {tmp_path}/quickstart.toml\n"
     assert (tmp_path / "quickstart.toml").is_file()
+
+
+def test_published_results_are_of_their_recipe_and_can_be_added_to() -> None:
+    places = [*(RECIPES / "results").glob("*/results.json")]
+    assert places
+    for place in places:
+        found, given = read_results(place), tomllib.loads((RECIPES / f"{place.parent.name}.toml").read_text())
+        assert found.recipe == place.parent.name and found.seeds and set(found.seeds) <= set(given["seeds"])
+        assert found.rows == tuple(given["methods"]) and merge([found, found]).lines == found.lines
