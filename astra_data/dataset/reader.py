@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from astra_data.core.arrays import Ints
+from astra_data.core.arrays import Bools, Ints
 from astra_data.core.errors import BadInputError, CorruptDatasetError, in_short, optional
 from astra_data.core.naming import RECORD, first_few
 from astra_data.dataset import description as described
@@ -185,6 +185,11 @@ class Dataset:
         sources, numbers = self.metadata.get("source_episode", [None] * len(self)), dict[int, int]()
         recorded = (uid if source is None else source for uid, source in zip(self.uids, sources, strict=True))
         return np.array([numbers.setdefault(int(uid), len(numbers)) for uid in recorded])
+
+    @cached_property
+    def held_out(self) -> Bools:
+        """Which episodes are marked as held out, (E,); none where nothing is marked."""
+        return np.array(self.metadata.get("held_out", [False] * len(self)), dtype=bool)
 
     def subset(self, count: int, seed: int | None = None) -> list[int]:
         """Return `count` episode indices; smaller subsets are prefixes of larger ones.

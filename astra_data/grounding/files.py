@@ -3,7 +3,7 @@
 import json
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 from astra_data.core.checkpoint import loaded, save_tensors, understood
 from astra_data.core.errors import BadInputError
@@ -15,7 +15,6 @@ from astra_data.worlds.user_code import explained, parts_of, restored
 
 if TYPE_CHECKING:
     from astra_data.grounding.alignment import TargetEncoder
-    from astra_data.grounding.history import HistoryGrounding
     from astra_data.grounding.model import GroundingModel
 
 GROUNDING, TARGET_ENCODER = "grounding.safetensors", "target_encoder.safetensors"  # files of their artifacts
@@ -51,10 +50,12 @@ def grounding_at(path: Path | None, device: str = "cpu") -> Grounding:
 
 def load_history_model(path: Path | str, device: str = "cpu") -> "GroundingModel":
     """Read a grounding that has to be a history model."""
+    from astra_data.grounding.history import HistoryGrounding
+
     grounding = load_grounding(path, device)
-    if grounding.kind != "history":
+    if not isinstance(grounding, HistoryGrounding):
         raise BadInputError(f"{path}: expected a history model, got a grounding without latents")
-    return cast("HistoryGrounding", grounding).model
+    return grounding.model
 
 
 def save_target_encoder(path: Path, encoder: "TargetEncoder") -> None:

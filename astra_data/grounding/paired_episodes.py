@@ -101,8 +101,7 @@ class PairedEpisodes:
             raise BadInputError(f"{root} has no column {names.ABSTRACT_STATE}: expected a dataset that was paired")
         known = {names.GOAL, names.REWARD, names.SUCCESS} & dataset.features.keys()
         columns = dataset.columns(list(dict.fromkeys([*_COLUMNS, *known, *inputs])))
-        lengths, held_out = dataset.lengths, np.array(dataset.metadata.get("held_out", ()), dtype=bool)
-        uids, recordings = dataset.uids, dataset.recordings
+        uids, lengths, recordings, held_out = dataset.uids, dataset.lengths, dataset.recordings, dataset.held_out
         if (made_up := _made_up(dataset, columns)).any():
             columns, lengths = _merged(columns, lengths, made_up)
             left = lengths > 0
@@ -110,8 +109,7 @@ class PairedEpisodes:
                 raise BadInputError(
                     f"{root}: no step is left: each episode has a single one, whose next state was made up"
                 )
-            held_out = held_out[left] if len(held_out) else held_out
-            uids, lengths, recordings = uids[left], lengths[left], recordings[left]
+            uids, lengths, recordings, held_out = uids[left], lengths[left], recordings[left], held_out[left]
         bounds = dataset.description["simulator"].get("commands")
         commands = Commands({name: tuple(ends) for name, ends in bounds.items()}) if bounds else None
         padded = {}

@@ -104,9 +104,8 @@ def _robomimic(dataset: Dataset, path: Path, out: Path) -> None:
 def _validation(dataset: Dataset) -> Bools:
     """Return which episodes (E,) are for validation; copies go where their recording goes."""
     recordings = dataset.recordings
-    held_out = np.array(dataset.metadata.get("held_out", [False] * len(dataset)), dtype=bool)
-    if held_out.any():
-        return np.isin(recordings, recordings[held_out])
+    if dataset.held_out.any():
+        return np.isin(recordings, recordings[dataset.held_out])
     ordered = list(dict.fromkeys(recordings[dataset.order].tolist()))
     train = len(ordered) - int(len(ordered) * VALID_SHARE)
     return np.isin(recordings, ordered[train:])

@@ -369,7 +369,7 @@ def data_condition(recipe: Recipe) -> Condition | None:
     check_fits(source, task)
     source.specs(recipe.align.inputs)
     grounds = any(method_named(row).grounds for row in recipe.methods)
-    if grounds and not any(source.metadata.get("held_out", ())):
+    if grounds and not source.held_out.any():
         name, recordings = source.reference, len(set(source.recordings))
         if recipe.sweep.percent:
             smallest = min(recipe.sweep.percent)

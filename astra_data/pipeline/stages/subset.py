@@ -14,8 +14,7 @@ def subset(dataset: Path, *, percent: int, of: int | None = None, out: Path, pro
     that the dataset marks as held out are in every size, and no part of the percentage.
     """
     source = Dataset.open(dataset)
-    marks = source.metadata.get("held_out", [False] * len(source))
-    held_out = {uid for uid, mark in zip(source.uids.tolist(), marks, strict=True) if mark}
+    held_out = set(source.uids[source.held_out].tolist())
     name = f"{source.description['name']}-percent{percent:03d}"
     folder = edit.subset(source, percent=percent, of=of, always=held_out, name=name, out=out)
     others = len(source) - len(held_out)
