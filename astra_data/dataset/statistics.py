@@ -1,8 +1,8 @@
 """Exact statistics of columns in float64, with LeRobot's names and shapes."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import groupby
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 import numpy as np
@@ -21,8 +21,8 @@ from astra_data.dataset.format import (
 from astra_data.dataset.parquet import RotatingWriter, read_arrays, to_arrow, to_lists
 from astra_data.dataset.plain import PlainColumn
 
-BLOCK_BYTES = 2**27  # of values held in memory at once, unless those of one index are more
-_PART = 2**18  # rows that are centered at once
+BLOCK_BYTES = 2**26  # of values held in memory at once, unless those of one index are more
+_PART = 2**16  # rows that are centered at once
 ROWS_AT_ONCE = 1000  # rows held in memory before they are written
 
 
@@ -58,26 +58,26 @@ def side_by_side[C: (Column, PlainColumn)](columns: Iterable[C]) -> Iterator[tup
 
 
 def global_statistics(columns: Sequence[Column], frames: int, paths: Sequence[Path]) -> dict[str, dict[str, list[Any]]]:
-    """Return meta/stats.json over all `frames`; quantiles are exact: all rows of an index are held in memory."""
-    parts: dict[str, list[Floats]] = {column.name: [] for column in columns}
-    indices = [(column, index) for column in columns for index in range(column.size)]
-    bytes_of = [frames * np.dtype(column.dtype).itemsize for column, _ in indices]
-    groups = np.cumsum(bytes_of) // BLOCK_BYTES
-    for _, group in groupby(zip(groups.tolist(), indices, strict=True), lambda one: one[0]):
-        chosen = [one for _, one in group]
-        rows = [np.empty((1, frames), column.dtype) for column, _ in chosen]
-        end = 0
-        names = {column.name for column, _ in chosen}
-        for block in read_arrays(paths, [column for column in columns if column.name in names]):
-            begin, end = end, end + len(next(iter(block.values())))
-            for row, (column, index) in zip(rows, chosen, strict=True):
-                row[0, begin:end] = as_rows(block[column.name])[:, index]
-        for row, (column, _) in zip(rows, chosen, strict=True):
-            parts[column.name].append(statistics(row))
+    """Return meta/stats.json over all `frames`; quantiles are exact, from the values of an index side by side."""
     stats: dict[str, dict[str, list[Any]]] = {}
-    for name, part in parts.items():
-        named = dict(zip(STATISTICS, np.concatenate(part, axis=1).tolist(), strict=True))
-        stats[name] = {key: named.get(key, [frames]) for key in STORED_STATISTICS}
+    for column in columns:
+        parts, dtype = list[Floats](), np.dtype(column.dtype)
+        most = max(1, BLOCK_BYTES // (frames * dtype.itemsize))
+        with TemporaryFile(dir=paths[0].parent) as turned:  # of each block that is read, index by index
+            lengths = list[int]()
+            for block in read_arrays(paths, [column]):
+                rows = as_rows(block[column.name])
+                turned.write(np.ascontiguousarray(rows.T).data)
+                lengths.append(len(rows))
+            for first in range(0, column.size, most):
+                values = np.empty((min(most, column.size - first), frames), dtype)
+                for end, count in zip(np.cumsum(lengths).tolist(), lengths, strict=True):
+                    turned.seek(((end - count) * column.size + first * count) * dtype.itemsize)
+                    read = np.frombuffer(turned.read(len(values) * count * dtype.itemsize), dtype)
+                    values[:, end - count : end] = read.reshape(len(values), count)
+                parts.append(statistics(values))
+        named = dict(zip(STATISTICS, np.concatenate(parts, axis=1).tolist(), strict=True))
+        stats[column.name] = {key: named.get(key, [frames]) for key in STORED_STATISTICS}
     return stats
 
 

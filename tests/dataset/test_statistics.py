@@ -7,6 +7,7 @@ import pyarrow.parquet as pq
 import pytest
 from fake_dataset import concatenated, fake_episodes, write_fake
 
+from astra_data.dataset import parquet
 from astra_data.dataset import statistics as episode_rows
 from astra_data.dataset import statistics as statistics
 from astra_data.dataset.columns import ACTION, REWARD, STATE, SUCCESS, Array, Column
@@ -33,12 +34,14 @@ def test_statistics_equal_numpy(shape: tuple[int, int]) -> None:
         np.testing.assert_allclose(row, expected[name], rtol=1e-12, atol=1e-13)
 
 
-@pytest.mark.parametrize(("block_bytes", "part"), [(1, 1), (500, 20), (2**24, 2**18)])
+@pytest.mark.parametrize(("block_bytes", "part", "rows"), [(1, 1, 1), (500, 20, 20), (2**24, 2**18, 2**14)])
 def test_global_statistics_are_exact(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block_bytes: int, part: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block_bytes: int, part: int, rows: int
 ) -> None:
     monkeypatch.setattr(statistics, "BLOCK_BYTES", block_bytes)
     monkeypatch.setattr(statistics, "_PART", part)
+    for name in ("GROUP_ROWS", "BLOCK_ROWS"):  # of a block that is read at once
+        monkeypatch.setattr(parquet, name, rows)
     root = write_fake(tmp_path / "set").root
     stats = json.loads((root / "meta/stats.json").read_text())
     for name in NAMES:
