@@ -69,3 +69,17 @@ class Record:
 
 def fill_the_disk(*, progress: Progress) -> None:
     raise OSError(errno.ENOSPC, "No space left on device")
+
+
+_PIECES: list[object] = []
+
+
+def free_much(progress: object) -> None:
+    """Free 256 MB in pieces of 64 kB, between others that are kept, so that the allocator keeps all."""
+    pieces = [bytearray(64_000) for _ in range(4000)]
+    _PIECES.extend(pieces[::100])
+
+
+def measure(path: Path, progress: object) -> None:
+    """Write how many pages of memory this process takes."""
+    path.write_text(Path("/proc/self/statm").read_text().split()[1])

@@ -12,7 +12,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fake_items import Record, crash, fail, fill_the_disk, hang, kill_itself, leave, rendezvous, touch
+from fake_items import (
+    Record,
+    crash,
+    fail,
+    fill_the_disk,
+    free_much,
+    hang,
+    kill_itself,
+    leave,
+    measure,
+    rendezvous,
+    touch,
+)
 
 from astra_data.core.durable import held
 from astra_data.core.errors import AstraDataError, DiskError, MissingStageError
@@ -71,6 +83,15 @@ def test_what_an_item_prints_is_in_its_log_and_an_empty_log_is_removed(
     os.write(2, b"and ours\n")
     shown = capfd.readouterr()
     assert "ours again\n" in shown.out and "and ours\n" in shown.err and "with care" not in shown.err
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="measures memory in /proc")
+def test_memory_that_an_item_frees_is_given_back(tmp_path: Path) -> None:
+    before, after = Item("before", (), partial(measure, tmp_path / "before")), tmp_path / "after"
+    freed = Item("freed", ("before",), free_much)
+    execute([before, freed, Item("after", ("freed",), partial(measure, after))], logs=tmp_path, watch=Record(), jobs=1)
+    pages = [int((tmp_path / name).read_text()) for name in ("before", "after")]
+    assert (pages[1] - pages[0]) * os.sysconf("SC_PAGE_SIZE") < 50e6  # of 256 MB
 
 
 def keep(path: Path, value: float) -> None:
