@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
+from statistics import fmean
 
 from astra_data.core.artifact import check_made_from, finished_folder
 from astra_data.core.config import AtOnce, Config
@@ -147,19 +148,18 @@ def select(recipe: Reported, config: SelectConfig = SelectConfig(), *, root: Pat
         for bench in contests:
             judges = {seed: load_grounding(root / key / GROUNDING) for seed, key in bench.judges.items()}
             for entry in bench.entries:
-                policy, success = entry.load(root, recipe.task), {}
-                for other in bench.judges:
-                    if other == entry.seed:
-                        continue
+                policy, success = entry.load(root, recipe.task), dict[int, float]()
+                others = [seed for seed in bench.judges if seed != entry.seed]
+                for number, other in enumerate(others, start=1):
                     read = f"{made_from[entry.policy]}/{made_from[bench.judges[other]]}"
                     if read not in known:
                         drawn = derive(other, f"judged: {entry.seed}")
                         known[read] = judged_success(policy.task, judges[other], policy, config.episodes, drawn)
+                        write_file(begun, json.dumps(known))
                     success[other] = known[read]
-                write_file(begun, json.dumps(known))
+                    note = f"{entry.row}, seed {entry.seed}: {fmean(success.values()):.2f}"
+                    progress((len(found) + number / len(others)) / total * 0.99, note)
                 found.append(Candidate(row=entry.row, seed=entry.seed, percent=entry.percent, success=success))
-                note = f"{entry.row}, seed {entry.seed}: {found[-1].predicted:.2f}"
-                progress(len(found) / total * 0.99, note)
         shares, made = recipe.settings.get("data") is not None, origin() | stopwatch.spent()
         judged = Judged(judge=judge, episodes=config.episodes, shares_episodes=shares, candidates=found, **made)
         begun.unlink()

@@ -89,7 +89,7 @@ def test_the_artifact_names_all_that_it_was_made_from(root: Path) -> None:
         judged(root)
 
 
-def test_an_interrupted_choice_goes_on_with_the_next_policy(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_choice_goes_on_with_the_next_judge(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole, asked = judged(root), list[object]()
     shutil.rmtree(root / "select")
 
@@ -103,7 +103,7 @@ def test_an_interrupted_choice_goes_on_with_the_next_policy(root: Path, monkeypa
     with pytest.raises(KeyboardInterrupt):
         judged(root)
     assert not (root / "select").exists() and judged(root).candidates == whole.candidates
-    assert len(asked) == 6 + 12 - 4  # two policies of two judges were done
+    assert len(asked) == 6 + 12 - 5
     assert not (root / "select/begun.json").exists()
 
 
