@@ -47,6 +47,9 @@ class TargetEncoder(nn.Module):
             self.sizes["sensing"], size = sensing, sensing["abstract_size"]
             self.pictures, self.unit_vectors = sensing["pictures"], sensing["unit_vectors"]
             self.estimator, self.estimate_head = ENCODERS[encoder](input_size, **alike), nn.Linear(latent_size, size)
+            self.estimate_now = nn.Linear(input_size, size)  # of the inputs, which a memory keeps coarsely
+            for parameter in self.estimate_now.parameters():
+                nn.init.zeros_(parameter)
             self.abstract_mean, self.abstract_std = nn.Buffer(torch.zeros(size)), nn.Buffer(torch.ones(size))
         self.state_mean, self.state_std = nn.Buffer(torch.zeros(state_size)), nn.Buffer(torch.ones(state_size))
         self.goal_mean, self.goal_std = nn.Buffer(torch.zeros(goal_size)), nn.Buffer(torch.ones(goal_size))
@@ -65,9 +68,9 @@ class TargetEncoder(nn.Module):
         take_scales(self, {"state": state, "goal": goal} | ({} if abstract is None else {"abstract": abstract}))
         self.state_std[list(unseen)] = torch.inf
 
-    def estimates(self, memory: Tensor) -> Tensor:
-        """Return φ(s) (..., X) as estimated after the last step that the estimator's `memory` (..., M) holds."""
-        normal = self.estimate_head(self.estimator.latent(memory))
+    def estimates(self, read: Tensor, memory: Tensor) -> Tensor:
+        """Return φ(s) (..., X) as estimated from `encoder_input` (..., I) and the memory (..., M) that includes it."""
+        normal = self.estimate_head(self.estimator.latent(memory)) + self.estimate_now(read)
         abstract: Tensor = self.abstract_mean + self.abstract_std * normal
         for first, end in self.unit_vectors:
             vector = functional.normalize(abstract[..., first:end], dim=-1)

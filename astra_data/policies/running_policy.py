@@ -162,7 +162,7 @@ class RunningPolicy:
     def _estimate(self, sensing: "TargetEncoder", inputs: Tensor, goal: Tensor) -> Tensor:
         read = sensing.encoder_input(inputs, goal, self.memory.previous_action)
         self._estimated = sensing.estimator.step(read, self._estimated)
-        return sensing.estimates(self._estimated)
+        return sensing.estimates(read, self._estimated)
 
     @without_gradients
     def _latent(self, encoder: LatentEncoder | None, seen: Tensor, goal: Tensor) -> Tensor | None:

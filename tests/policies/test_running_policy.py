@@ -68,6 +68,7 @@ def sensing(**pictures: Any) -> TargetEncoder:
     read |= {"abstract_size": 4, "unit_vectors": []}
     encoder = TargetEncoder(29, 2, 2, embedding_size=8, latent_size=8, position_octaves=0, sensing=read)
     encoder.abstract_std.fill_(3.0)
+    torch.nn.init.normal_(encoder.estimate_now.weight)
     return encoder
 
 
@@ -85,7 +86,7 @@ def test_with_inputs_the_policy_observes_an_estimate_in_place_of_phi(aligned: bo
     given: list[Shown] = [{names[0]: STATE[:, step, :3], names[1]: STATE[:, step, 3:].numpy()} for step in range(6)]
     actions = TASK.limits.normal(torch.stack([running.command(one, GOAL) for one in given], dim=1))
     read = eyes.encoder_input(STATE, GOALS, previous(actions))
-    abstract = eyes.estimates(eyes.estimator.sequence(read)[1])
+    abstract = eyes.estimates(read, eyes.estimator.sequence(read)[1])
     if aligned:
         latent, _ = eyes.encoder(read)
     else:

@@ -110,7 +110,7 @@ def align(
             windows, state = training.draw_windows(config.batch_windows, window)
             discrepancy, distance = _losses(model, encoder, windows, state, bandwidths)
             loss = discrepancy + config.paired_weight * distance
-            descent.update(loss + _estimate_error(encoder, windows, state).mean() if config.inputs else loss)
+            descent.update(loss + _estimate_apart(encoder, windows, state).abs().mean() if config.inputs else loss)
             if descent.done % _MEASURED_EVERY == 0 or descent.done == fitting.updates:
                 measured = _agreement(model, encoder, held_out, bandwidths)
                 error = measured["mmd"] + config.paired_weight * measured["latent_rmse"] ** 2
@@ -123,8 +123,8 @@ def align(
         encoder.latent_r2.fill_(agreement["latent_r2"])
         save_target_encoder(folder / TARGET_ENCODER, encoder)
         if config.inputs:
-            squared = _estimate_error(encoder, held_out.windows, held_out.target_state)
-            agreement |= {"estimate_rmse": (squared.sqrt() * encoder.abstract_std).tolist()}
+            apart = _estimate_apart(encoder, held_out.windows, held_out.target_state)
+            agreement |= {"estimate_rmse": (apart.square().mean(0).sqrt() * encoder.abstract_std).tolist()}
             encodes = "ψ^t" if encoder.is_deployed else "ψ^s on the estimated abstract state"
             r2 = agreement["latent_r2"]
             progress(1.0, f"ψ^t explains {r2:.2f} of the latents' variance: the policy runs with {encodes}")
@@ -165,12 +165,15 @@ def _agreement(
     explained = 1.0 - distance / variance if variance > 0 else torch.zeros_like(distance)
     found = {"mmd": float(discrepancy), "latent_rmse": float(distance.sqrt()), "latent_r2": float(explained)}
     if encoder.inputs:
-        found["estimate_error"] = float(_estimate_error(encoder, episodes.windows, episodes.target_state).mean())
+        found["estimate_error"] = float(_estimate_apart(encoder, episodes.windows, episodes.target_state).abs().mean())
     return found
 
 
-def _estimate_error(encoder: "TargetEncoder", windows: PairedWindows, state: Tensor) -> Tensor:
-    """Return the mean squared error (X,) of the estimated φ(s_i), in units of its variance."""
-    _, memory = encoder.estimator.sequence(encoder.encoder_input(state, windows.goal, windows.previous_action))
-    squared = ((encoder.estimates(memory) - windows.state) / encoder.abstract_std).square()
-    return (squared * windows.mask.unsqueeze(-1)).sum((0, 1)) / windows.mask.sum()
+def _estimate_apart(encoder: "TargetEncoder", windows: PairedWindows, state: Tensor) -> Tensor:
+    """Return how far the estimated φ(s_i) of N real steps is off, (N, X), in units of its deviation.
+
+    The mean of their sizes is what falls: squares would be those of what no camera sees.
+    """
+    read = encoder.encoder_input(state, windows.goal, windows.previous_action)
+    _, memory = encoder.estimator.sequence(read)
+    return ((encoder.estimates(read, memory) - windows.state) / encoder.abstract_std)[windows.mask.bool()]
