@@ -34,6 +34,7 @@ from astra_data.pipeline.plan import plan
 from astra_data.pipeline.recipe import Recipe, read_tables
 from astra_data.pipeline.stages.label import check_fits, remarks
 from astra_data.pipeline.stages.registry import STAGES
+from astra_data.pipeline.stages.report import JSON
 from astra_data.reports.results import Results, read_results
 from astra_data.robots.registry import task_named
 from astra_data.worlds.commands import Commands
@@ -156,7 +157,7 @@ class Experiment:
     def published(self) -> list[Path]:
         """Return the published results that are there of this recipe and, if it borrows evaluations, of its base."""
         names = dict.fromkeys((self.maker("evaluate").path.stem, self.path.stem))
-        files = [file for name in names if (file := self.results / f"{name}.json").exists()]
+        files = [file for name in names if (file := self.results / name / JSON).exists()]
         for file in files:
             if changed := self._changed_since(read_results(file)):
                 since = f"{changed} in {self.path} since the results in {file} were made"

@@ -181,12 +181,12 @@ def test_the_base_has_published_what_is_borrowed_of_it(base: Path, longer: Path)
     part = base.with_name("part.toml")
     part.write_text('based_on = "base"\nmethods = ["astra"]\n')
     settings = load_experiment(base, base.parent).recipe.settings
-    (base.parent / "results").mkdir()
     for name in ("base", "part"):
-        (base.parent / f"results/{name}.json").write_text(results_json(bare_results(name, {}, settings)))
+        (base.parent / f"results/{name}").mkdir(parents=True)
+        (base.parent / f"results/{name}/results.json").write_text(results_json(bare_results(name, {}, settings)))
     for path, expected in ((base, ["base"]), (longer, []), (part, ["base", "part"])):
         found = load_experiment(path, base.parent).published()
-        assert found == [base.parent / f"results/{name}.json" for name in expected]
+        assert found == [base.parent / f"results/{name}/results.json" for name in expected]
 
 
 @pytest.mark.parametrize(

@@ -442,15 +442,15 @@ def test_a_report_is_added_to_what_is_published_beside_the_recipe(
     asked = stages.asked["report"]
     assert (asked["publish"], asked["published"]) == (results, [])
     settings = load_experiment(recipe, tmp_path).recipe.settings
-    results.mkdir()
-    (results / "r.json").write_text(results_json(bare_results("r", {"astra": [0]}, settings)))
+    (results / "r").mkdir(parents=True)
+    (results / "r/results.json").write_text(results_json(bare_results("r", {"astra": [0]}, settings)))
     run_stage(recipe, "report", root=tmp_path, publish=True)
-    assert stages.asked["report"]["published"] == [results / "r.json"]
+    assert stages.asked["report"]["published"] == [results / "r/results.json"]
     run_stage(recipe, "report", root=tmp_path)
     assert stages.asked["report"]["publish"] is None
     for table in ("[report]\ntrajectory_episodes = 7\n", "[rma]\nextrinsics_size = 7\n"):
         recipe.write_text(text + table)
-        assert load_experiment(recipe, tmp_path).published() == [results / "r.json"]
+        assert load_experiment(recipe, tmp_path).published() == [results / "r/results.json"]
     recipe.write_text(text + "[evaluate]\nepisodes = 7\n")
     with pytest.raises(RecipeError, match=r"^evaluate \(episodes: 100, now 7\) changed .* since the results"):
         run_stage(recipe, "report", root=tmp_path, publish=True)

@@ -74,10 +74,11 @@ def test_the_command_line_lists_and_copies(tmp_path: Path) -> None:
     assert (tmp_path / "quickstart.toml").is_file()
 
 
-def test_published_results_are_of_their_recipe_and_can_be_added_to() -> None:
+def test_published_results_are_of_their_recipe_and_can_be_added_to(tmp_path: Path) -> None:
     places = [*(RECIPES / "results").glob("*/results.json")]
     assert places
     for place in places:
         found, given = read_results(place), tomllib.loads((RECIPES / f"{place.parent.name}.toml").read_text())
         assert found.recipe == place.parent.name and found.seeds and set(found.seeds) <= set(given["seeds"])
         assert found.rows == tuple(given["methods"]) and merge([found, found]).lines == found.lines
+        assert load_experiment(RECIPES / f"{found.recipe}.toml", tmp_path).published() == [place]

@@ -108,9 +108,9 @@ def test_results_that_were_published_with_other_settings_of_theirs_are_not_the_r
 
     def published(**changes: object) -> None:
         row = "nas" if changes.pop("other", None) else "delta"
-        (tmp_path / "results").mkdir(exist_ok=True)
+        (tmp_path / "results/own").mkdir(parents=True, exist_ok=True)
         found = bare_results("own", {row: [0]}, settings | changes)
-        (tmp_path / "results/own.json").write_text(results_json(found))
+        (tmp_path / "results/own/results.json").write_text(results_json(found))
 
     published()
     assert len(load_experiment(recipe, tmp_path).published()) == 1

@@ -61,7 +61,7 @@ def report(
     progress: Progress = silent,
     config: ReportConfig = ReportConfig(),
 ) -> None:
-    """Write results.json, .md and .html and the figures to `root`/report, with copies in `publish` and `published`."""
+    """Write results.json, .md and .html and figures to `root`/report; with `published` ones, to `publish`/<recipe>."""
     from astra_data.reports.figures.catalog import FIGURES, drawn
     from astra_data.reports.figures.style import Scene
     from astra_data.reports.page import sections_of
@@ -93,13 +93,13 @@ def report(
         for name, image in images.items():
             write_file(folder / f"{name}.png", image)
     if publish is not None:
-        publish.mkdir(parents=True, exist_ok=True)
-        files = {name: f"{recipe.name}_{name}.png" for name in FIGURES}
+        folder = publish / recipe.name
+        folder.mkdir(parents=True, exist_ok=True)
         for name, image in images.items():
-            write_file(publish / files[name], image)
-        shown = {name: file for name, file in files.items() if (publish / file).exists()}
-        write_file(publish / f"{recipe.name}.json", results_json(found))
-        write_file(publish / f"{recipe.name}.md", markdown(found.recipe, sections, shown))
+            write_file(folder / f"{name}.png", image)
+        shown = {name: file for name in FIGURES if (folder / (file := f"{name}.png")).exists()}
+        write_file(folder / JSON, results_json(found))
+        write_file(folder / PAGE, markdown(found.recipe, sections, shown))
     progress(1.0, verdict_of(found).text.replace("**", ""))
 
 

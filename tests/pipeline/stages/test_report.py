@@ -154,28 +154,28 @@ def test_publishing_adds_to_what_is_there(
     rough: None, root: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     draw_only("trajectories", monkeypatch)
-    folder = tmp_path / "results"
-    file = folder / "antmaze_u.json"
-    make(root, folder, FakeRecipe(seeds=(0, 1)))
-    made = {"antmaze_u_trajectories.png", "antmaze_u.json", "antmaze_u.md"}
-    assert {path.name for path in folder.iterdir()} == made
-    drawn = (folder / "antmaze_u_trajectories.png").read_bytes()
+    results = tmp_path / "results"
+    folder = results / "antmaze_u"
+    file = folder / "results.json"
+    make(root, results, FakeRecipe(seeds=(0, 1)))
+    assert {path.name for path in folder.iterdir()} == {"trajectories.png", "results.json", "results.md"}
+    drawn = (folder / "trajectories.png").read_bytes()
     for row in ROWS:
         for seed in (0, 1):
             shutil.rmtree(root / f"evaluate/{row}/seed_{seed}")
     shutil.rmtree(root / "evaluate/astra_plus")
-    make(root, folder, published=(file,))
+    make(root, results, published=(file,))
     found = read_results(file)
     assert found.values("astra", "success") == {0: 0.5, 1: 0.25, 2: 0.75}
     assert found.values("astra_plus", "success") == {0: 1.0, 1: 0.75}
     # The trajectories of ASTRA+ are not here: the figure stays as it is.
-    page = (folder / "antmaze_u.md").read_text()
-    assert "](antmaze_u_trajectories.png)" in page and (folder / "antmaze_u_trajectories.png").read_bytes() == drawn
+    page = (folder / "results.md").read_text()
+    assert "](trajectories.png)" in page and (folder / "trajectories.png").read_bytes() == drawn
     assert not caplog.records
     # A changed result replaces the earlier one, and it is said.
     edit_json(root / "evaluate/astra/seed_2/evaluation.json", target=outcomes([0, 0, 0, 0], 2))
     with caplog.at_level(logging.WARNING):
-        make(root, folder, FakeRecipe(methods=("astra",)), published=(file,))
+        make(root, results, FakeRecipe(methods=("astra",)), published=(file,))
     assert "new results replace those of astra seed 2 (success 0.75, now 0)" in caplog.text
     assert read_results(file).values("astra_plus", "success") == {0: 1.0, 1: 0.75}
     (tmp_path / "broken.json").write_text("{}")
@@ -186,7 +186,7 @@ def test_publishing_adds_to_what_is_there(
 def test_a_choice_without_the_target_is_reported_and_stays_published(root: Path, tmp_path: Path) -> None:
     write_choice(root)
     make(root, tmp_path / "results")
-    page = (tmp_path / "results/antmaze_u.md").read_text()
+    page = (tmp_path / "results/antmaze_u/results.md").read_text()
     assert "**ASTRA, seed 2**, chosen from 6 policies: predicted success 1.00 [" in page
     assert "| ASTRA | 3 | +0.40 | 0.40 |" in page and "| ASTRA+ | 3 | -0.58 | 0.58 |" in page
     # ASTRA has 0.5, 0.25 and 0.75 in the target, its ranks are right; the best there is ASTRA+ with 1.
@@ -195,8 +195,8 @@ def test_a_choice_without_the_target_is_reported_and_stays_published(root: Path,
     manifest = read_manifest(root / "report")
     assert manifest and manifest.made_from["select"] == file_digest(root / "select/select.json")
     shutil.rmtree(root / "select")
-    make(root, tmp_path / "results", published=(tmp_path / "results/antmaze_u.json",))
-    assert "**ASTRA, seed 2**, chosen from 6" in (tmp_path / "results/antmaze_u.md").read_text()
+    make(root, tmp_path / "results", published=(tmp_path / "results/antmaze_u/results.json",))
+    assert "**ASTRA, seed 2**, chosen from 6" in (tmp_path / "results/antmaze_u/results.md").read_text()
 
 
 def test_sizes_are_set_side_by_side(rough: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -219,7 +219,7 @@ def test_sizes_are_set_side_by_side(rough: None, tmp_path: Path, monkeypatch: py
     assert (head, astra) == (["method", "50 %", "100 %"], ["ASTRA", "0.25 ± 0.25", "0.50 ± 0.25"])
     assert direct == ["Direct transfer", "-", "0.12 ± 0.18 (2 of 3 seeds)"]
     assert "Not finished yet: Direct transfer at 50 %." in html.text and "data_efficiency" in images(root / "report")
-    assert (tmp_path / "results/sizes_data_efficiency.png").exists()
+    assert (tmp_path / "results/sizes/data_efficiency.png").exists()
 
 
 def test_lasting_tasks_are_reported_by_survived_steps_and_return(
