@@ -12,7 +12,7 @@ from typer.core import TyperArgument, TyperOption
 
 from astra_data.cli import datasets, recipes, sharing
 from astra_data.core.durable import NO_FSYNC, disk_error
-from astra_data.core.errors import AstraDataError, missing_extra
+from astra_data.core.errors import AstraDataError, BadInputError, missing_extra
 from astra_data.core.naming import in_lines
 
 app = typer.Typer(
@@ -108,9 +108,18 @@ app.add_typer(
 )
 
 
+def _refuse_a_removed_folder() -> None:
+    """Refuse to work in a folder that was removed, or replaced, since the shell went there."""
+    try:
+        os.getcwd()
+    except FileNotFoundError:
+        raise BadInputError("the folder that this shell is in was removed or replaced: cd to it again") from None
+
+
 def main() -> None:
     """Run the command line; print what is expected to happen as one line unless ASTRA_DATA_DEBUG is set."""
     try:
+        _refuse_a_removed_folder()
         app()
     except Exception as error:
         reported = _reported(error)

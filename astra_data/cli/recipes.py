@@ -362,7 +362,7 @@ def augment(
     out: arguments.Out = None,
     seed: Annotated[int, typer.Option(help="Random seed.")] = 0,
 ) -> None:
-    """Add rotated and shifted copies of episodes; the dataset must not be paired yet."""
+    """Add rotated and shifted copies of episodes in a maze; the dataset must not be paired yet."""
     from astra_data.dataset.versions import locate
 
     _make("augment", task, settings, dataset=locate(dataset), seed=seed, name=name, out=out)

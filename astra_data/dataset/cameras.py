@@ -333,8 +333,8 @@ class ClipWriter:
 
 def pooled(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return the statistics over several episodes from those of each, as lerobot does; quantiles are estimates."""
-    known = {key for key in layout.STORED_STATISTICS if all(part.get(key) is not None for part in parts)}
-    if not parts or not known >= {"count", "min", "max", "mean", "std"}:
+    known = [key for key in layout.STORED_STATISTICS if all(part.get(key) is not None for part in parts)]
+    if not parts or not {*known} >= {"count", "min", "max", "mean", "std"}:
         return {}
     values = {key: np.array([part[key] for part in parts], float) for key in known}
     count = values["count"].reshape(-1, *([1] * (values["mean"].ndim - 1)))

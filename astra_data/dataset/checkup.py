@@ -104,6 +104,7 @@ MANY_GAPS = 0.01  # share of the steps from which on gaps are many
 INNER = 0.95  # share of the steps that the rate and the jitter are of
 FINE = 1000  # shares of a period, and `MOST_PERIODS` of them, beyond which a step is in another unit than is thought
 MOST_PERIODS = 100
+_COARSE = 0.1  # periods between neighboring times in float32 above which they stand still by rounding
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
 
 
@@ -123,6 +124,7 @@ class Clock:
     is_whole: bool = False  # whether the times are integers
     steps_s: list[Floats] = field(default_factory=list)  # of each episode, (n,)
     uids: list[int] = field(default_factory=list)
+    farthest_s: float = 0.0  # the largest time
 
     @classmethod
     def of(cls, column: Column, fps: int) -> Self:
@@ -132,7 +134,9 @@ class Clock:
 
     def add(self, episode: Episode) -> None:
         """Count the steps between the times of the next episode."""
-        self.count(np.diff(episode.columns[self.name].astype(np.float64)) * self.scale, episode.uid)
+        times_s = episode.columns[self.name].astype(np.float64) * self.scale
+        self.farthest_s = max(self.farthest_s, float(np.abs(times_s).max()))
+        self.count(np.diff(times_s), episode.uid)
 
     def count(self, steps_s: Floats, uid: int = 0) -> None:
         """Count steps of the episode `uid`, (n,) in s."""
@@ -168,12 +172,12 @@ class Clock:
         """Tell a wrong rate, gaps, jitter, and where time stands still or goes back."""
         found, (period_s, gaps, share, jitter) = [], self.rates()
         if standing := [u for u, steps_s in zip(self.uids, self.steps_s, strict=True) if (steps_s <= 0).any()]:
-            remedy = "store it as seconds since the start (`offset`) or as int64"
-            if self.is_whole:
-                remedy = (
-                    "look for duplicate rows in the log or a clock that was set back, and in MCAP for an "
-                    "`fps` that is too high or a topic that drops out (`gap_s`)"
-                )
+            remedy = (
+                "look for duplicate rows in the log or a clock that was set back, and in MCAP for an "
+                "`fps` that is too high or a topic that drops out (`gap_s`)"
+            )
+            if not self.is_whole and float(np.spacing(np.float32(self.farthest_s))) * self.fps > _COARSE:
+                remedy = "store it as seconds since the start (`offset`) or as int64"
             what = f"{self.name} stands still or goes back between steps"
             advice = f"{remedy}, or leave the episodes out: {deletion(called, standing)}"
             found.append(Finding("warning", what, advice, tuple(standing)))

@@ -1,5 +1,6 @@
 """New versions of a dataset with other steps: trimmed, without some steps, or at another rate."""
 
+import logging
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -12,12 +13,15 @@ import numpy as np
 from astra_data.core.arrays import Bools, Floats, as_rows
 from astra_data.core.config import did_you_mean
 from astra_data.core.errors import BadInputError
+from astra_data.core.naming import first_few
 from astra_data.dataset import columns as names
-from astra_data.dataset.checkup import TURNS
+from astra_data.dataset.checkup import SHOWN, TURNS
 from astra_data.dataset.columns import Array, Column, Episode, new_uid
 from astra_data.dataset.inspection import outcome_of
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import Change, next_version
+
+_log = logging.getLogger(__name__)
 
 _COMPARED = {"<=": le, ">=": ge, "==": eq, "!=": ne, "<": lt, ">": gt}
 _CONDITION = re.compile(r"\s*(.+?)\s*(<=|>=|==|!=|<|>)\s*(\S+)\s*")
@@ -91,12 +95,17 @@ def _write(
     source: Dataset, change: Change, schema: Sequence[Column], episodes: Iterator[Episode], fps: int, **described: Any
 ) -> Path:
     """Write the episodes as the next version, `described` as `next_version` takes it."""
+    left_out = dict.fromkeys(source.uids.tolist())
     with next_version(source, change, fps=fps, schema=schema, **described) as writer:
-        count = 0
-        for count, episode in enumerate(episodes, start=1):  # noqa: B007
+        for episode in episodes:
             writer.add(episode)
-        if not count:
+            left_out.pop(episode.uid, None)
+        if len(left_out) == len(source):
             raise BadInputError(f"{source.reference}: nothing of its {len(source)} episodes would be left")
+    if left_out:
+        _log.warning(
+            "nothing remains of %d of %d episodes: %s", len(left_out), len(source), first_few([*left_out], SHOWN)
+        )
     return writer.root
 
 

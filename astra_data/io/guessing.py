@@ -10,13 +10,13 @@ from typing import Literal
 
 import numpy as np
 
-from astra_data.core.arrays import Floats
+from astra_data.core.arrays import Floats, Ints
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.checkup import ANGLE, LARGEST, is_angle
 from astra_data.dataset.columns import ACTION, GOAL, STATE, SUCCESS, TERMINATED, TIMESTAMP
 from astra_data.dataset.reader import Dataset, refuse_run, refuse_versions
 from astra_data.io.cutting import RATE_TOLERANCE
-from astra_data.io.importers.csv import SUFFIXES, is_number, numbers_of, texts_of
+from astra_data.io.importers.csv import SUFFIXES, decimal_comma, is_number, numbers_of, texts_of
 from astra_data.io.recording import Source, foreign, refuse_dataset
 
 Role = Literal["time", "episode", "state", "command", "goal", "failure", "success", "reward", "left out"]
@@ -156,6 +156,9 @@ def guess(paths: Sequence[Path]) -> Logs:
         is_taken = found.role in ("state", "command") and found.taken_for in [one.taken_for for one in fields]
         fields.append(replace(found, short=plain_name(name)) if is_taken else found)
     fields = _places(_roles(_times(fields, raw)), raw)
+    for time in (field for field in fields if field.role == "time"):
+        _check_rates(sources, [np.diff(table[time.name]) * time.scale for table in tables])
+        raw = [part for one in raw for part in _cut(one, 1 + np.flatnonzero(np.diff(one[time.name]) < 0))]
     for role, example in (("command", "cmd_v"), ("state", "x")):
         if role not in [field.role for field in fields]:
             listed = ", ".join(f"{field.name} ({field.role})" for field in fields)
@@ -182,13 +185,28 @@ def guess(paths: Sequence[Path]) -> Logs:
     return logs
 
 
+def _check_rates(sources: Sequence[Source], steps_s: Sequence[Floats]) -> None:
+    """Refuse a file whose rows come at another rate than those of most; `steps_s` (T - 1,) are of each file."""
+    rates = [1 / float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0 for steps in steps_s]
+    usual = sorted(rates)[len(rates) // 2]
+    for source, rate in zip(sources, rates, strict=True):
+        if rate and usual and abs(rate / usual - 1) > RATE_TOLERANCE:
+            raise BadInputError(
+                f"{source.path}: expected {usual:.4g} rows per second, as in other files, got {rate:.4g}: "
+                "leave it out, or resample it"
+            )
+
+
 def _episodes(table: dict[str, Floats]) -> list[dict[str, Floats]]:
     """Cut a file where a field of the episode changes."""
-    cuts = {0, len(next(iter(table.values())))}
-    for name, values in table.items():
-        if EPISODE.fullmatch(plain_name(name)) and _is_whole(values):
-            cuts |= set((1 + np.flatnonzero(np.diff(values))).tolist())
-    return [{name: values[a:b] for name, values in table.items()} for a, b in pairwise(sorted(cuts))]
+    episode = [v for name, v in table.items() if EPISODE.fullmatch(plain_name(name)) and _is_whole(v)]
+    return _cut(table, np.concatenate([1 + np.flatnonzero(np.diff(values)) for values in [*episode, np.zeros(1)]]))
+
+
+def _cut(table: dict[str, Floats], begins: Ints) -> list[dict[str, Floats]]:
+    """Cut rows where others begin."""
+    cuts = sorted({0, len(next(iter(table.values()))), *begins.tolist()})
+    return [{name: values[a:b] for name, values in table.items()} for a, b in pairwise(cuts)]
 
 
 def _field(name: str, series: Sequence[Floats]) -> Field:
@@ -205,12 +223,15 @@ def _field(name: str, series: Sequence[Floats]) -> Field:
     ends = all(one[-1] and one[np.argmax(one > 0) :].all() and one.sum() <= MOST_END_ROWS for one in flags)
     goal = GOAL_NAME.fullmatch(body)
     is_goal = goal and (goal["axis"] or not is_flag) and not any(map(np.ptp, series))
-    rises = (STAMP.fullmatch(clock) or time_unit) and (steps >= 0).all() and (steps > 0).any()
+    falls = bool((steps < 0).any())
+    is_rising = (steps > 0).mean() > MOSTLY if falls else (steps > 0).any()
+    rises = (STAMP.fullmatch(clock) or time_unit) and len(steps) and is_rising
     named, lacking = "its name", len(values) - len(finite)
     ended = f"all {len(flags)} of {len(series)} episodes that have a 1"
     roles: list[tuple[object, Role, str]] = [
         (not plain, "left out", "no letter a to z"),
         (not finite.size, "left out", "texts, dates or nothing: expected numbers, of a time in s, ms, us or ns"),
+        (rises and falls, "time", "it goes back, where episodes begin (CHECK)"),
         (rises, "time", "its ending, and it never goes back" if time_unit else f"steps of {step:g}"),
         (TIME.fullmatch(clock), "left out", "a time that does not rise"),
         (UNCLEAR.fullmatch(plain), "left out", "an end, but which? name it success or failed"),
@@ -348,8 +369,9 @@ def read_numbers(source: Source) -> tuple[dict[str, Floats], bool]:
         if len(cells) < 2:
             raise BadInputError(f"{source}: expected two rows or more below its header, got {len(cells)}: leave it out")
         texts = cells.to_pylist()
-        words = sum(bool(text and not is_number(text)) for text in texts)
-        values = numbers_of(cells, source, name) if words < (1 - MOSTLY) * len(texts) else np.empty(0)
+        words = [text for text in texts if text and not is_number(text)]
+        is_number_field = len(words) < (1 - MOSTLY) * len(texts) or decimal_comma(words[0])  # which is refused
+        values = numbers_of(cells, source, name) if is_number_field else np.empty(0)
         if len(values) and values.ndim == 1:
             numbers[name] = values.astype(float)
         elif EPISODE.fullmatch(plain_name(name)) and not cells.null_count:

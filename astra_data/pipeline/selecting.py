@@ -4,14 +4,13 @@ import logging
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from shutil import copy2
 from typing import Any
 
 import numpy as np
 
-from astra_data.core.artifact import SHEET, finished_folder, read_manifest
+from astra_data.core.artifact import read_manifest
 from astra_data.core.config import only_given, validated
-from astra_data.core.durable import alone_in
+from astra_data.core.durable import alone_in, write_file
 from astra_data.core.errors import BadInputError
 from astra_data.core.lazy import Tensor, torch
 from astra_data.core.progress import Progress, part, silent
@@ -78,6 +77,7 @@ def _is_current(folder: Path, recipe: Reported, config: SelectConfig) -> bool:
     read = digests([bench.finished(folder) for bench in benches(recipe, judge_in(recipe, config))], folder)
     manifest = read_manifest(out)
     same = manifest is not None and manifest.made_from == read and not manifest.faults(out, verify=False)
+    same = same and (out / choice.PAGE).is_file()
     if same and (out / "config.json").read_text() == config.model_dump_json(indent=1):
         return True
     aside = set_aside(folder, choice.FOLDER)
@@ -137,7 +137,7 @@ def choose_by_trials(
                 )
     begun, shown = there or begun, part(progress, 0.5, 1.0)
     rounds = list(begun.rounds)  # of which nothing is tried again
-    sheet = Sheet(path.parent / SHEET, task)
+    sheet = Sheet(path.parent / choice.SHEET, task)
 
     def planned(number: int) -> list[Tensor]:
         rng, one = np.random.default_rng(derive(number, "trials by hand")), rounds[number]
@@ -216,13 +216,7 @@ class _LeftForLaterError(Exception):
 
 
 def _write(folder: Path, judged: choice.Judged, trials: choice.TrialsFile) -> None:
-    """Write the choice again, with its trials."""
+    """Write the trials so far, and the page again."""
     out = folder / choice.FOLDER
-    manifest = read_manifest(out)
-    assert manifest is not None
-    with finished_folder(out, replace=True, made_from=manifest.made_from) as partly:
-        for name in ("config.json", choice.SELECTED, SHEET):
-            if (out / name).is_file():
-                copy2(out / name, partly / name)
-        (partly / choice.TRIALS).write_text(trials.model_dump_json(indent=1))
-        (partly / "select.md").write_text(choice.select_page(folder.name, judged, trials))
+    write_file(out / choice.TRIALS, trials.model_dump_json(indent=1))
+    write_file(out / choice.PAGE, choice.select_page(folder.name, judged, trials))

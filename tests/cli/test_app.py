@@ -182,6 +182,19 @@ def test_bad_input_is_one_line_and_exit_code_1(
     assert capsys.readouterr().err == f"error: {tmp_path / 'none.toml'} does not exist\n"
 
 
+def test_a_folder_that_is_gone_is_told(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    monkeypatch.setattr(sys, "argv", ["astra-data", "log", "walks"])
+    with pytest.raises(SystemExit, match="1"):
+        cli.main()
+    assert capsys.readouterr().err.endswith("this shell is in was removed or replaced: cd to it again\n")
+
+
 def test_debugging_shows_the_traceback(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     def broken() -> None:
         raise BadInputError("expected this")

@@ -262,3 +262,4 @@ def test_statistics_of_episodes_are_pooled() -> None:
     for key in ("min", "max", "mean", "std"):
         np.testing.assert_allclose(found[key], getattr(np, key)(every, axis=0))
     assert found["count"] == [14] and pooled([each[0], {}]) == {}
+    assert [*found] == ["min", "max", "mean", "std", "count"]  # not as a set orders them, by chance

@@ -367,3 +367,12 @@ def test_time_that_never_goes_on_has_no_rate() -> None:
     assert str(timed) == "10 Hz declared; time does not increase in most steps"
     (finding,) = timed.findings("walks")
     assert finding.what == "time stands still or goes back between steps"
+
+
+def test_times_that_float32_rounds_are_told_apart_from_rows_that_are_there_twice() -> None:
+    found = []
+    for began in (0.0, 1.7e9):
+        stamps = Clock.of(Column("time"), 10)
+        stamps.add(Episode(0, {"time": (began + np.array([0, 1, 1, *range(2, 20)]) / 10).astype(np.float32)}))
+        found.append(stamps.findings("walks")[0].advice)
+    assert found[0].startswith("look for duplicate rows") and found[1].startswith("store it as seconds since the start")

@@ -33,10 +33,14 @@ def made(path: Path) -> list[Episode]:
     return list(Dataset.open(path).episodes())
 
 
-def test_time_goes_from_both_ends_and_what_lost_its_end_is_truncated(source: Dataset, tmp_path: Path) -> None:
+def test_time_goes_from_both_ends_and_what_lost_its_end_is_truncated(
+    source: Dataset, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     found = made(trim(source, start_s=0.1, end_s=0.2, out=tmp_path / "out"))  # 2 and 4 of 20 steps a second
     before = {episode.uid: episode for episode in source.episodes()}
     assert [len(one) for one in found] == [length - 6 for length in LENGTHS if length > 6]
+    gone = [f"{uid}" for uid, length in zip(source.uids, LENGTHS, strict=True) if length <= 6]
+    assert caplog.messages == [f"nothing remains of {len(gone)} of {len(LENGTHS)} episodes: {', '.join(gone)}"]
     for one in found:
         whole = before[one.uid].columns
         np.testing.assert_array_equal(one.columns[STATE], whole[STATE][2:-4])

@@ -21,6 +21,7 @@ def write(path: Path, columns: Mapping[str, object], rows: int = 6) -> Path:
 
 
 def found(folder: Path, *logs: Mapping[str, object]) -> Logs:
+    folder.mkdir(exist_ok=True)
     for number, columns in enumerate(logs):
         write(folder / f"log{number}.csv", columns)
     return guess([folder])
@@ -196,3 +197,24 @@ def test_what_is_of_no_use_is_refused_in_one_line(content: bytes, expected: str,
 def test_files_have_the_same_fields(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match=r"log1.csv: expected the fields of .*log0.csv, \['x', 'cmd'\]: got"):
         found(tmp_path, {"x": RAMP, "cmd": RAMP}, {"x": RAMP, "cmd_v": RAMP})
+
+
+def test_where_the_time_goes_back_an_episode_begins(tmp_path: Path) -> None:
+    time = np.concatenate([np.arange(30), np.arange(12)]) / 20
+    place = write(tmp_path / "log.csv", {"time_s": time, "x": time**2, "cmd_v": np.sin(time)}, rows=42)
+    logs = guess([place])
+    assert [len(episode["x"]) for episode in logs.episodes] == [30, 12] and logs.recorded_rate == pytest.approx(20)
+    assert logs.of("time")[0].why == "it goes back, where episodes begin (CHECK)"
+
+
+def test_a_file_of_another_rate_is_named(tmp_path: Path) -> None:
+    logs = [{"t": RAMP / rate, "x": RAMP, "cmd": -RAMP} for rate in (20, 21, 10)]
+    assert found(tmp_path / "two", *logs[:2]).rate == 20
+    with pytest.raises(BadInputError, match=r"log2.csv: expected 20 rows per second, as in other files, got 10: leave"):
+        found(tmp_path, *logs)
+
+
+def test_decimal_commas_are_told(tmp_path: Path) -> None:
+    (tmp_path / "log.tsv").write_text("t\tx\tcmd_v\n0,0\t1\t2\n0,05\t1\t2\n")
+    with pytest.raises(BadInputError, match=r"line 2: field 't': .* got '0,0': write decimal points, as in 0\.05$"):
+        guess([tmp_path])

@@ -56,7 +56,7 @@ def whole_lines(source: Source, name: str) -> tuple[bytes, bool]:
     if delimiter not in first and (others := [other for part, other in _MARKS.items() if part in first]):
         raise BadInputError(
             f"{name}: expected fields parted by {_MARKS[delimiter]}, got {others[0]} in its header: "
-            "write it with commas, or with tabs as .tsv"
+            "write it with commas, or with tabs as .tsv, and numbers with decimal points"
         )
     tail = content[max(content.rfind(b"\n"), content.rfind(b"\r")) + 1 :]
     mark = delimiter.encode()
@@ -86,7 +86,8 @@ def explained(name: str, source: Source) -> Iterator[None]:
                         f"{name} cannot be read as csv: line {number}: Expected {len(header)} columns, got "
                         f"{len(cells)}: {advice}"
                     ) from None
-        raise BadInputError(f"{name}: expected CSV with a header ({in_short(error)})") from None
+        advice = "leave it out" if "Empty" in str(error) else _SAVE
+        raise BadInputError(f"{name}: expected CSV with a header ({in_short(error)}): {advice}") from None
 
 
 def line_of(source: Source, row: int) -> int:
@@ -195,6 +196,11 @@ def is_number(text: str) -> bool:
     return bool(_NUMBER.fullmatch(text.strip())) or text.strip().lower() in ("", "true", "false")
 
 
+def decimal_comma(text: str) -> str:
+    """Return what to do about a cell that is a number with a decimal comma; empty for any other."""
+    return ": write decimal points, as in 0.05" if re.fullmatch(r"\s*[+-]?\d*,\d+\s*", text) else ""
+
+
 def numbers_of(texts: pa.StringArray, source: Source, field: str) -> Array:
     """Return the numbers of a field's `texts`, without blanks around them."""
     trimmed = pc.utf8_trim_whitespace(texts)
@@ -209,7 +215,7 @@ def numbers_of(texts: pa.StringArray, source: Source, field: str) -> Array:
     if not any(lists):
         words = [row for row, cell in enumerate(cells) if cell and not _NUMBER.fullmatch(cell)]
         row = ([row for row in words if not is_number(cells[row])] or words or [0])[0]
-        expected = f"numbers, or true and false, got '{cells[row]}'"
+        expected = f"numbers, or true and false, got '{cells[row]}'{decimal_comma(cells[row])}"
         raise BadInputError(f"{source} line {line_of(source, row)}: field '{field}': expected {expected}")
     rows: list[list[float]] = []  # of cells that are lists, "[0.1, 2]" or "[0.1 2]"
     for row, cell in enumerate(lists):

@@ -20,7 +20,7 @@ from astra_data.grounding.files import GROUNDING, grounding_at, load_grounding
 from astra_data.methods import grounded_as, method_named
 from astra_data.policies.episodes import judged_from, judged_success
 from astra_data.policies.running_policy import POLICY, PolicyFile, RunningPolicy, running
-from astra_data.reports.choice import FOLDER, SELECTED, Candidate, Judged, select_page
+from astra_data.reports.choice import FOLDER, PAGE, SELECTED, Candidate, Judged, select_page
 from astra_data.reports.runs import Reported
 from astra_data.robots.registry import task_named
 
@@ -164,6 +164,6 @@ def select(recipe: Reported, config: SelectConfig = SelectConfig(), *, root: Pat
         judged = Judged(judge=judge, episodes=config.episodes, shares_episodes=shares, candidates=found, **made)
         begun.unlink()
         (folder / SELECTED).write_text(judged.model_dump_json(indent=1))
-        (folder / "select.md").write_text(select_page(recipe.name, judged))
+        (folder / PAGE).write_text(select_page(recipe.name, judged))
     first = judged.ranked(judged.percents[-1])[0]
     progress(1.0, f"{first.row}, seed {first.seed}: {first.lower:.2f} in the lower quartile of its judges")

@@ -76,7 +76,7 @@ def test_who_judges_whom_with_what_drawn_where(root: Path, monkeypatch: pytest.M
 def test_the_artifact_names_all_that_it_was_made_from(root: Path) -> None:
     judged(root)
     manifest = read_manifest(root / "select")
-    assert manifest is not None and set(manifest.files) == {"config.json", "select.json", "select.md"}
+    assert manifest is not None and set(manifest.files) == {"config.json", "select.json"}
     policies = {f"train/{row}/seed_{seed}" for row in ROWS for seed in SEEDS}
     groundings = {f"ground/nas/seed_{seed}" for seed in SEEDS}
     assert set(manifest.made_from) == policies | groundings
