@@ -124,7 +124,7 @@ class Logs:
     def uneven(self) -> str:
         """Why the rate is not known to be whole, and what to do; empty where it is one within `_EVEN`."""
         if not self.of("time"):
-            return f"the logs have no time field, so {self.rate} rows per second are assumed: set fps and TIMESTEP_S"
+            return f"the logs have no time in numbers: {self.rate} rows per second are assumed; set fps, TIMESTEP_S"
         error = self.recorded_rate / self.rate - 1
         warning = (
             f"the logs have {self.recorded_rate:.4g} rows per second, not a whole number: TIMESTEP_S is "
