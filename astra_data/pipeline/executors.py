@@ -16,6 +16,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from graphlib import TopologicalSorter
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from threading import Thread, current_thread, main_thread
@@ -235,6 +236,7 @@ class _Worker:
         self.connection, theirs = context.Pipe()
         self.process = context.Process(target=_serve, args=(theirs, prepare))
         # Ctrl-C reaches every process of the terminal; children ignore it and are stopped by this one.
+        resource_tracker.ensure_running()  # its start unblocks the signal
         before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
         self.process.start()
         signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -220,6 +220,16 @@ def test_a_failure_stops_the_others(tmp_path: Path) -> None:
     assert _is_gone(int(pid_file.read_text()))
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="looks at a process in /proc")
+def test_processes_of_items_do_not_notice_ctrl_c(tmp_path: Path) -> None:
+    parent = _hanging_run(tmp_path)
+    status = Path(f"/proc/{(tmp_path / 'pid').read_text()}/status").read_text()
+    parent.send_signal(signal.SIGTERM)
+    parent.communicate(timeout=PATIENCE_S)
+    blocked = next(line.split()[1] for line in status.splitlines() if line.startswith("SigBlk"))
+    assert int(blocked, 16) & 1 << signal.SIGINT - 1
+
+
 def test_ctrl_c_stops_the_processes(tmp_path: Path) -> None:
     parent = _hanging_run(tmp_path)
     # As in a terminal, Ctrl-C reaches the whole process group.
