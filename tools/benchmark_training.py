@@ -11,6 +11,7 @@ machine that does other work.
 """
 
 import json
+import math
 from contextlib import ExitStack
 from dataclasses import asdict
 from enum import StrEnum
@@ -32,6 +33,7 @@ from astra_data.grounding.model import GroundingModel, GroundingShape
 from astra_data.grounding.simulator import NO_GROUNDING, Grounding
 from astra_data.methods.iql import Experience, Iql, IqlConfig
 from astra_data.pipeline.recipe import Recipe
+from astra_data.policies import ppo as proximal
 from astra_data.policies.networks import ActorCritic, ActorCriticShape
 from astra_data.policies.ppo import Ppo
 from astra_data.policies.simulator_env import SimulatorEnv
@@ -110,6 +112,7 @@ def recurrent_ppo(_quick: bool, stack: ExitStack) -> tuple[str, Candidates]:
 def ppo_stretch(grounding: Grounding, memory_size: int) -> Stretch:
     """Make one iteration of the recipe's training."""
     env, policy, config = ppo_parts(grounding, memory_size)
+    proximal._MAX_KL = math.inf  # all passes are made, as others make them
     ppo = Ppo(env, policy, config, horizon=TASK.objective.horizon, seed=0)
 
     def stretch() -> int:
