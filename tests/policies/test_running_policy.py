@@ -57,7 +57,7 @@ def test_latents_are_those_of_the_whole_history(aligned: bool, in_simulator: boo
     else:
         latent, _ = model.encoder(model.encoder_input(abstract, GOALS, previous(actions)))
     observation = policy_observation(TASK.objective, abstract, GOALS, latent)
-    torch.testing.assert_close(actions, policy.policy(observation)[0], atol=1e-4, rtol=0)
+    torch.testing.assert_close(actions, policy.policy(observation)[0], atol=1e-5, rtol=0)
     assert actions.abs().max() > 0.1
     assert running.observation_size == 16 and RunningPolicy(TASK, policy, observed="full").observation_size == 33
 
@@ -92,9 +92,9 @@ def test_with_inputs_the_policy_observes_an_estimate_in_place_of_phi(aligned: bo
     else:
         latent, _ = model.encoder(model.encoder_input(abstract, GOALS, previous(actions)))
     observation = policy_observation(TASK.objective, abstract, GOALS, latent)
-    torch.testing.assert_close(actions, policy.policy(observation)[0], atol=1e-5, rtol=0)
+    torch.testing.assert_close(actions, policy.policy(observation)[0], atol=1e-4, rtol=0)
     running.start(3)  # forgets
-    torch.testing.assert_close(running.act(STATE[:, 0], GOAL), actions[:, 0], atol=1e-5, rtol=0)
+    torch.testing.assert_close(running.act(STATE[:, 0], GOAL), actions[:, 0], atol=1e-4, rtol=0)
 
 
 @torch.no_grad()
