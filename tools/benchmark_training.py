@@ -35,7 +35,6 @@ from astra_data.methods.iql import Experience, Iql, IqlConfig
 from astra_data.pipeline.recipe import Recipe
 from astra_data.policies import ppo as proximal
 from astra_data.policies.networks import ActorCritic, ActorCriticShape
-from astra_data.policies.ppo import Ppo
 from astra_data.policies.simulator_env import SimulatorEnv
 from astra_data.policies.train import PpoTrainConfig
 from astra_data.robots.ant.tasks import POSITIONS, VelocityController
@@ -113,7 +112,7 @@ def ppo_stretch(grounding: Grounding, memory_size: int) -> Stretch:
     """Make one iteration of the recipe's training."""
     env, policy, config = ppo_parts(grounding, memory_size)
     proximal._MAX_KL = math.inf  # all passes are made, as others make them
-    ppo = Ppo(env, policy, config, horizon=TASK.objective.horizon, seed=0)
+    ppo = proximal.Ppo(env, policy, config, horizon=TASK.objective.horizon, seed=0)
 
     def stretch() -> int:
         ppo.iterate()

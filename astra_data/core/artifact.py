@@ -15,7 +15,7 @@ from astra_data.core.errors import BadInputError
 CHECKPOINT = "checkpoint.safetensors"  # name, or the end of it, of the file that a training goes on from
 _SETTINGS = "config.json"  # name of the file of the settings in a folder
 MANIFEST = "manifest.json"
-TRIALS = ("trials.csv", "trials.json", "select.md")  # what trials in the target change later: no manifest has it
+GROWING = ("trials.csv", "trials.json", "select.md")  # what trials in the target change later: no manifest has it
 
 
 def refuse_finished(out: Path) -> None:
@@ -148,6 +148,6 @@ def read_manifest(folder: Path) -> Manifest | None:
 
 
 def _files(folder: Path) -> dict[str, Path]:
-    """Return the files in `folder`, by their paths inside it, without its manifest and `TRIALS`."""
+    """Return the files in `folder`, by their paths inside it, without its manifest and what is `GROWING`."""
     files = {path.relative_to(folder).as_posix(): path for path in sorted(folder.rglob("*"))}
-    return {name: path for name, path in files.items() if path.is_file() and name not in (MANIFEST, *TRIALS)}
+    return {name: path for name, path in files.items() if path.is_file() and name not in (MANIFEST, *GROWING)}

@@ -56,11 +56,11 @@ class StableBaselinesEnv(VecEnv):
 
     def set_attr(self, attr_name: str, value: object, indices: object = None) -> None:
         """Refuse."""
-        raise NotImplementedError
+        raise NotImplementedError("rows of one batch have no attributes of their own")
 
     def env_method(self, method_name: str, *args: object, indices: object = None, **kwargs: object) -> list[Any]:
         """Refuse."""
-        raise NotImplementedError
+        raise NotImplementedError("rows of one batch have no methods of their own")
 
     def env_is_wrapped(self, wrapper_class: type, indices: object = None) -> list[bool]:
         """Know of no wrappers."""

@@ -9,13 +9,14 @@ from statistics import fmean
 import numpy as np
 from pydantic import Field
 
+from astra_data.core.artifact import GROWING
 from astra_data.methods import method_title
 from astra_data.reports.artifacts import Artifact, WrittenPart, read_json
 from astra_data.reports.blocks import Section, TableBlock, Text, markdown
 from astra_data.reports.statistics import LEAST_SEEDS, Estimate, interval, success_rate, summarize
 
-FOLDER, SELECTED, PAGE = "select", "select.json", "select.md"
-TRIALS, SHEET = "trials.json", "trials.csv"  # their record, and what a person fills in
+FOLDER, SELECTED = "select", "select.json"
+SHEET, TRIALS, PAGE = GROWING  # what a person fills in, the record of trials, and the page
 PSEUDO_TRIALS = 4  # trials that a prediction counts as: as a Beta prior it is then off by 0.2 or so, as predictions are
 LEAST_TRIALS = 2  # of a candidate in a round: with one, chance decides; with more, fewer candidates are tried at all
 _QUANTILE = 0.25  # of the success over judges, for ranking policies: one that a single judge likes is a risk

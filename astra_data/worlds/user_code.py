@@ -45,9 +45,8 @@ def found_near(name: str, folder: Path) -> str:
     place, folder = Path(name.rpartition(":")[0]), folder.resolve()
     if place.suffix != ".py":
         return name
-    found = next((one / place for one in (folder, *folder.parents) if (one / place).is_file()), None)
-    is_here = found is None or (place.is_file() and place.samefile(found))
-    return name if is_here else f"{found}:{name.rpartition(':')[2]}"
+    found = next((one for one in (folder, *folder.parents) if (one / place).is_file()), Path.cwd())
+    return name if found == Path.cwd() else str(found / name)
 
 
 def offered(group: str) -> dict[str, str]:
