@@ -35,16 +35,13 @@ def run(
         str | None,
         typer.Option(help="Of a Ray cluster, whose machines share this folder and installation.", show_default="here"),
     ] = None,
-    trackio: Annotated[
-        str | None, typer.Option(metavar="PROJECT", help="Log each finished point to this trackio project.")
-    ] = None,
 ) -> None:
     """Run all stages of a recipe; after an interruption, run it again to continue."""
     arguments.recipe_at(recipe)
     from astra_data.pipeline.run import run as run_recipe
 
     which: dict[str, Any] = {"methods": methods or (), "seeds": seeds or (), "percents": percents or (), "until": until}
-    how: dict[str, Any] = {"jobs": jobs, "device": device, "engine": engine, "address": address, "trackio": trackio}
+    how: dict[str, Any] = {"jobs": jobs, "device": device, "engine": engine, "address": address}
     with arguments.resumable():
         show_made(run_recipe(recipe, **which, root=root, **how), until)
 

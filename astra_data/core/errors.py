@@ -58,7 +58,7 @@ EXTRAS = {
     **dict.fromkeys(("onnxruntime", "onnxscript"), "deploy"),
     **dict.fromkeys(("lerobot", "datasets", "av"), "lerobot"),
     **dict.fromkeys(("mcap", "mcap_protobuf", "mcap_ros2"), "mcap"),
-    **{"h5py": "hdf5", "minari": "minari", "ray": "ray", "trackio": "trackio", "rerun": "view"},
+    **{"h5py": "hdf5", "minari": "minari", "ray": "ray", "rerun": "view"},
 }  # which extra brings each package
 _ROOT = Path(__file__).parents[2]
 

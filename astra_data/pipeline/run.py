@@ -4,7 +4,7 @@ import csv
 import json
 import logging
 import re
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import partial
 from io import StringIO
 from itertools import count
@@ -15,7 +15,7 @@ from rich.console import Console
 
 from astra_data.core.config import did_you_mean
 from astra_data.core.durable import alone_in, clean, folder_for, make_folder, move, write_file
-from astra_data.core.errors import BadInputError, MissingStageError, optional
+from astra_data.core.errors import BadInputError, MissingStageError
 from astra_data.core.lazy import torch
 from astra_data.core.naming import CODE, RECORD, RUNS, artifact_key, reference_of, row_of_key, stage_of_key
 from astra_data.grounding.diagnosis import diagnose
@@ -68,14 +68,13 @@ def run(
     until: str | None = None,
     engine: str = "processes",
     address: str | None = None,
-    trackio: str | None = None,
 ) -> Path:
     """Make every artifact of a recipe that is not finished yet; return the recipe's folder, which is in `root`.
 
     Of its rows, seeds and sizes, those given are made, by default all, up to the stage `until`. There are `jobs`
     items at a time, by default one per core, or two on a CUDA device, run by an `engine` in `EXECUTORS`, Ray's at an
-    `address`. Each finished point is logged to a project of `trackio`, if one is given. Where it grounds, the page
-    of held-out errors is written, too; where it ends with that or with the pairs, what they say before any fit.
+    `address`. Where it grounds, the page of held-out errors is written, too; where it ends with that or with the
+    pairs, what they say before any fit.
 
     Raises:
         RecipeError: the recipe has faults, or differs from the one that made the existing artifacts.
@@ -96,11 +95,9 @@ def run(
     experiment = load_experiment(recipe_path, root)
     wanted = stages - experiment.borrowed
     part = Selection.of(experiment.recipe, methods, seeds, percents)
-    log = _tracked(trackio, experiment.folder.name) if trackio else lambda _: None
     planned = plan(experiment.recipe, recipe_path, experiment.folder, part, device=device)
     items = [item for item in planned if item.stage in wanted]
-    table = part.points(), log
-    make(experiment, items, planned, jobs=jobs, device=device, engine=engine, address=address, table=table)
+    make(experiment, items, planned, jobs=jobs, device=device, engine=engine, address=address, points=part.points())
     if "ground" in wanted:
         write_errors(experiment, part)
     if until in ("pair", "ground"):
@@ -211,12 +208,12 @@ def make(
     device: str = "cpu",
     engine: str = "processes",
     address: str | None = None,
-    table: tuple[Mapping[str, Owner], Callable[[dict[str, Any]], object]] | None = None,
+    points: Mapping[str, Owner] | None = None,
 ) -> None:
     """Make those of an experiment's `items` that are not finished yet, damaged or stale.
 
-    What is made again is set aside. The `items` stand after those they read, which are among `planned`. Of a `table`
-    of points, those that finish are shown, logged, and written with all others.
+    What is made again is set aside. The `items` stand after those they read, which are among `planned`. Those of
+    `points` that finish are shown, and written with all others.
     """
     check_device(device, engine, address)
     recipe, folder = experiment.recipe, experiment.folder
@@ -243,8 +240,8 @@ def make(
         if digests := digests_of(recipe.task, recipe.own_methods):
             write_file(folder / CODE, json.dumps(recorded_code(folder) | digests, indent=1) + "\n")
         experiment.write_made_with(items)
-        points, log = table or ({}, lambda _: None)
-        if table:
+        points = points or {}
+        if points:
             _write_points(experiment)
 
         def finished(key: str) -> None:
@@ -252,7 +249,6 @@ def make(
                 lines, headline = _write_points(experiment), recipe.headline
                 done = f"{len(points.keys() & lines)} of {len(points)} points"
                 show(f"{key}  done {headline.text(lines[key][headline.measure])}  ({done})")
-                log(lines[key])
 
         with display([item.key for item in items], console, finished) as watch:
             EXECUTORS[engine](
@@ -353,16 +349,3 @@ def _needed(key: str, items: Mapping[str, Item]) -> Iterator[str]:
     for read in items[key].inputs:
         if not (key.startswith("evaluate/") and read.startswith("ground/")):
             yield from _needed(read, items)
-
-
-def _tracked(project: str, recipe: str) -> Callable[[dict[str, Any]], None]:
-    trackio = optional("trackio")
-
-    def log(line: dict[str, Any]) -> None:
-        named = {key: line[key] for key in ("method", "percent", "seed")}
-        settings = named | {key: value for key, value in line.items() if isinstance(value, str)}
-        trackio.init(project=project, name=" ".join(map(str, (recipe, *named.values()))), config=settings)
-        trackio.log({key: value for key, value in line.items() if isinstance(value, float)})
-        trackio.finish()
-
-    return log

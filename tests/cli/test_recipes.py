@@ -64,12 +64,12 @@ def test_a_run_passes_its_options_on(recipe: Path, tmp_path: Path, monkeypatch: 
 
     monkeypatch.setattr("astra_data.pipeline.run.run", run)
     words = "--method nas --seed 1 --seed 0 --percent 50 --jobs 3 --device cuda --root elsewhere"
-    words += " --trackio ants --until ground --engine ray --address head:6379"
+    words += " --until ground --engine ray --address head:6379"
     assert CliRunner().invoke(cli.app, ["run", str(recipe), *words.split()]).exit_code == 0
     assert CliRunner().invoke(cli.app, ["run", str(recipe)]).exit_code == 0
     assert asked[0] == {
         **{"methods": ["nas"], "seeds": [1, 0], "percents": [50], "jobs": 3, "device": "cuda"},
-        **{"root": Path("elsewhere"), "trackio": "ants", "until": "ground", "engine": "ray"},
+        **{"root": Path("elsewhere"), "until": "ground", "engine": "ray"},
         "address": "head:6379",
     }
     assert asked[1]["engine"] == "processes" and not asked[1]["methods"]

@@ -4,9 +4,7 @@ import csv
 import json
 import re
 import shutil
-import sys
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -412,25 +410,6 @@ def test_a_sweep_goes_on_point_by_point_and_makes_shared_artifacts_once(
     assert times["nas"] == "" and float(times["follower"]) > 0
     text = SWEEP.replace("[50, 150]", "[25, 150]")
     assert changed(recipe, text) == [] and "collect" in changed(recipe, text.replace("150]", "200]"))
-
-
-def test_finished_points_are_logged(recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    told: list[Any] = []
-    trackio = SimpleNamespace(
-        init=lambda **settings: told.append(settings), log=told.append, finish=lambda: told.append("finished")
-    )
-    recipe.write_text(SWEEP)
-    part: dict[str, Any] = {"methods": ["follower"], "seeds": [1], "percents": [50], "root": tmp_path}
-    monkeypatch.setitem(sys.modules, "trackio", None)
-    with pytest.raises(BadInputError, match="uv sync --extra trackio"):
-        run(recipe, **part, trackio="ants")
-    assert not (tmp_path / "r").exists()
-    monkeypatch.setitem(sys.modules, "trackio", trackio)
-    for _ in range(2):
-        run(recipe, **part, trackio="ants")
-    began, logged, ended = told
-    assert (began["project"], began["name"], ended) == ("ants", "r follower 50 1", "finished")
-    assert began["config"]["dataset_hash"] == "hash1" and logged["success"] == 1.0
 
 
 def test_a_report_is_added_to_what_is_published_beside_the_recipe(
