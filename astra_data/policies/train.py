@@ -57,9 +57,9 @@ class TrainConfig(Config):
     episode_steps: Count | None = None
     """Steps after which simulated episodes are truncated and their values bootstrapped; by default the task's
     horizon. In short episodes from recorded states, errors have no time to grow (Janner et al. 2019)."""
-    tries: AtOnce = 3
+    tries: AtOnce = 2
     """Maximum number of training runs. A policy that does not master its own simulator (in 100 episodes from
-    the task's starts, acting by the mean of its actions) is trained again with another seed."""
+    the task's starts, acting by the mean of its actions) is trained again with another seed, twice as long."""
     least_success: Share = 0.8
     """Success in these episodes at which a simulator is mastered; if no try reaches it, the best one is kept."""
 
@@ -242,7 +242,10 @@ class InTarget:
 
 
 def with_restarts(learn: Learn, training: Training, grounding_file: Path | None) -> tuple[PolicyFile, dict[str, Any]]:
-    """Train until a policy masters its own simulator, `tries` times at most, and return the best with its curve."""
+    """Train until a policy masters its own simulator, `tries` times at most, and return the best with its curve.
+
+    Each training is twice as long as the one before: a task that takes longer is more frequent than an unlucky seed.
+    """
     config, made = training.config, list[tuple[Reached, PolicyFile, dict[str, Any]]]()
     if config.tries == 1:
         return learn(training)
@@ -251,9 +254,11 @@ def with_restarts(learn: Learn, training: Training, grounding_file: Path | None)
     for number, seed in enumerate(seeds):  # the first is the training that there would be without tries
         folder = training.folder / (f"try_{number}" if number else "")
         folder.mkdir(exist_ok=True)
-        share = part(training.progress, number / config.tries, (number + 1) / config.tries)
+        begins, ends = ((2**count - 1) / (2**config.tries - 1) for count in (number, number + 1))  # of all steps
+        share = part(training.progress, begins, ends)
         noted = partial(_noted, share, f"try {number + 1} of {config.tries}")
-        policy, curve = learn(replace(training, seed=seed, folder=folder, progress=noted))
+        longer = config.model_copy(update={"total_steps": config.total_steps * 2**number})
+        policy, curve = learn(replace(training, config=longer, seed=seed, folder=folder, progress=noted))
         policy.save(folder / POLICY)
         saved = PolicyFile.load(folder / POLICY)
         made.append((reached_in_own_world(training.task, saved, grounding, training.seed), policy, curve))

@@ -207,6 +207,7 @@ def test_each_try_has_its_part_of_the_progress_and_a_policy_says_what_it_learned
 
     monkeypatch.setattr("astra_data.policies.train.reached_in_own_world", lambda *_: Reached(0.0, 1.0))
     learned, _ = train.with_restarts(learn, given, None)
-    assert notes == [(0.25, "try 1 of 2  half"), (0.75, "try 2 of 2  half")]
+    shares, told = zip(*notes, strict=True)
+    assert shares == pytest.approx((1 / 6, 4 / 6)) and told == ("try 1 of 2  half", "try 2 of 2  half")
     assert (learned.dataset, learned.content_hash) == (given.episodes.reference, given.episodes.content_hash)
     assert learned.dataset != learned.content_hash and learned.observed == "abstract"
