@@ -1,4 +1,4 @@
-"""Check the intervals of trials by hand: how often they cover, and how many trials predictions save.
+"""Check choices without the target: regrets, coverage of intervals with trials, and trials that predictions save.
 
     uv run python tools/check_intervals.py RUN [RUN ...]
 
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from astra_data.core.seeding import derive
-from astra_data.pipeline.selecting import _asked, select
+from astra_data.pipeline.selecting import asked_of, select
 from astra_data.pipeline.stages.select import predicted_from
 from astra_data.pipeline.trained_policy import trained_policy
 from astra_data.policies.episodes import in_target, started
@@ -29,7 +29,7 @@ Values = NDArray[np.float64]
 
 def outcomes(run: Path) -> list[tuple[Values, Values, int]]:
     """Return each policy's success (100,), predictions for the same starts, and how many episodes judged it."""
-    (recipe, config), found = _asked(run, (), None, None), []
+    (recipe, config), found = asked_of(run), []
     for one in (judged := select(run)).candidates:
         policy, first = trained_policy(run, one.row, seed=one.seed).running(), list[Tensor]()
         outcome = in_target(policy.task, partial(_begun, policy, first), STARTS, derive(one.seed, "check")).outcome
@@ -68,6 +68,11 @@ def main(*runs: str) -> None:
     """Print a line for each run and number of trials."""
     for run in map(Path, runs):
         policies = outcomes(run)
+        success, predicted = np.array([[of.mean() for of in one[:2]] for one in policies]).T
+        print(
+            f"{run.name}: the best predicted {success[predicted.argmax()]:.2f}, the best {success.max():.2f}, "
+            f"all {success.mean():.2f}"
+        )
         alone = [np.mean([resampled(success, None, 1, n)[1] for success, _, _ in policies]) for n in ALONE]
         for trials in TRIALS:
             found = np.array([resampled(*policy, trials) for policy in policies])

@@ -40,7 +40,7 @@ def select(
     progress: Progress = silent,
 ) -> choice.Judged:
     """Judge every trained policy of a run, as the stage `select` does; a choice made of the same is kept."""
-    folder, (recipe, config) = Path(run), _asked(run, rows, judge, episodes)
+    folder, (recipe, config) = Path(run), asked_of(run, rows, judge, episodes)
     with alone_in(folder):
         if not _is_current(folder, recipe, config) or choice.read_judged(folder) is None:
             judge_all(recipe, config, root=folder, progress=progress)
@@ -49,9 +49,10 @@ def select(
     return judged
 
 
-def _asked(
-    run: str | Path, rows: Sequence[str], judge: str | None, episodes: int | None
+def asked_of(
+    run: str | Path, rows: Sequence[str] = (), judge: str | None = None, episodes: int | None = None
 ) -> tuple[Reported, SelectConfig]:
+    """Return what is judged of a run, and how; without `rows` all, and as its recipe says."""
     folder, settings = Path(run), settings_of(run)
     add_all(settings.get("own_methods", {}))
     asked = (settings.get("select") or {}) | only_given(judge=judge, episodes=episodes)
@@ -147,7 +148,7 @@ def choose_by_trials(
 
     def at_robot(number: int, those: tuple[int, ...], ask: Ask) -> None:
         if not rounds[number].predicted:
-            (recipe, config), starts, predicted = _asked(run, rows, judge, episodes), planned(number), []
+            (recipe, config), starts, predicted = asked_of(run, rows, judge, episodes), planned(number), []
             for one in those:
                 shown(0.0, f"predicts {candidates[one].name} from the starts of round {number + 1}")
                 predicted.append(predicted_from(recipe, config, candidates[one], *starts, root=folder))
