@@ -106,11 +106,10 @@ def test_the_packages_encoder_says_where_in_a_picture_something_is(source: Datas
     np.testing.assert_allclose(columns[COLUMN][:14], ENCODER(pictures), atol=1e-6)
     again = features(source, "top", out=tmp_path / "again")
     assert Dataset.open(again).content_hash == Dataset.open(made).content_hash
-    field = np.zeros((3, 64, 64, 3), np.uint8)
-    field[0, 8:16, 8:16] = field[1, 8:16, 40:48] = field[2, 40:48, 8:16] = 255
-    here, right, below = ENCODER(field)
-    assert (right[:32] - here[:32]).max() > 0.5 and abs(right[32:] - here[32:]).max() < 0.1
-    assert (below[32:] - here[32:]).max() > 0.5 and abs(below[:32] - here[:32]).max() < 0.1
+    right, down = np.exp(-((np.arange(64) - np.array([[20.25], [40.75]])) ** 2) / 8)
+    spot = (np.outer(down, right)[..., None] * [250, 120, 30]).astype(np.uint8)
+    right_px, down_px = (ENCODER(spot[None])[0].reshape(2, 32) + 1) / 2 * 63
+    assert sum(abs(right_px - 20.25) < 0.05) > 16 and sum(abs(down_px - 40.75) < 0.05) > 16  # colors like the spot's
 
 
 @pytest.mark.parametrize(
