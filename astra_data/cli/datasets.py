@@ -178,6 +178,8 @@ def inspect(
     from astra_data.dataset.inspection import inspect_dataset
     from astra_data.dataset.versions import open_dataset
 
+    if json is not None and json.exists():
+        raise BadInputError(f"{json} exists already; delete it or choose another file.")
     found = open_dataset(dataset)
     inspection, checkup = inspect_dataset(found), check_up(found, quote(dataset))
     Console(soft_wrap=True).print(inspection_page(inspection, checkup))

@@ -67,7 +67,7 @@ def complete_description(description: Mapping[str, Any]) -> dict[str, Any]:
 def _faults(description: Mapping[str, Any]) -> list[str]:
     name, version, stage, parents = (description[key] for key in ("name", "version", "stage", "parents"))
     checks = {
-        f"name {name!r:.80}, expected up to 200 letters, digits, '.', '_' and '-'": (
+        f"name {name!r:.80}, expected up to 200 of A-Z, a-z, 0-9, '.', '_' and '-', a letter or digit first": (
             isinstance(name, str) and NAME.fullmatch(name)
         ),
         f"version {version!r:.80}, expected three numbers such as 1.0.0": (

@@ -11,7 +11,7 @@ import numpy as np
 from astra_data.core.config import did_you_mean, only_given
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import first_few
-from astra_data.dataset.columns import Scalar, distinct_uids, renamed_metadata
+from astra_data.dataset.columns import REWARD, Scalar, distinct_uids, renamed_metadata
 from astra_data.dataset.compare import schema_differences
 from astra_data.dataset.description import permutation
 from astra_data.dataset.reader import Dataset
@@ -118,8 +118,10 @@ def filter_episodes(
     """Write the episodes of `source` that meet all conditions; bounds are inclusive, what is unknown meets none."""
     given = {"success": success, "min_return": min_return, "max_return": max_return}
     config = only_given(**given, min_length=min_length, max_length=max_length)
+    if np.isnan([bound for bound in (min_return, max_return) if bound is not None]).any():
+        raise BadInputError("a filter's bounds on the return: expected numbers, got nan")
     if not config:
-        raise BadInputError("a filter needs a condition: on success, return or length")
+        raise BadInputError("a filter needs a condition: on success, return or length, or uids to leave out")
     kept, uids = set(source.uids.tolist()), source.uids.tolist()
     bounds = {"success": (success, success), "return": (min_return, max_return), "length": (min_length, max_length)}
     for key, (low, high) in bounds.items():
@@ -193,6 +195,9 @@ def _facts(source: Dataset, key: str) -> Sequence[Scalar | None]:
         return [int(length) for length in source.lengths]
     if key == "success" and (successes := source.successes()) is not None:
         return successes
+    if key == "return" and key not in source.metadata and REWARD in source.features:
+        starts = np.cumsum([0, *source.lengths[:-1]])
+        return [float(paid) for paid in np.add.reduceat(source.columns([REWARD])[REWARD], starts)]
     if key not in source.metadata:
         if key in ("success", "return"):
             raise BadInputError(f"the episodes of {source.reference} have no {key!r}: run `astra-data label --task`")

@@ -3,11 +3,13 @@
 import logging
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import pyarrow as pa
 
 from astra_data.core.arrays import Ints
 from astra_data.core.errors import BadInputError, CorruptDatasetError
@@ -19,8 +21,8 @@ from astra_data.dataset.cameras import Camera, read_cameras
 from astra_data.dataset.columns import Array, Column, Scalar
 from astra_data.dataset.description import ContentHash, Digests, complete_description, digest_of, permutation
 from astra_data.dataset.format import DEFAULT_COLUMNS, INFO_PATH, reserved_values
-from astra_data.dataset.parquet import read_blocks
-from astra_data.dataset.plain import MOST_FPS, PlainColumn, Run, plain_columns
+from astra_data.dataset.parquet import UNREADABLE, open_parquet, read_blocks
+from astra_data.dataset.plain import MOST_FPS, PlainColumn, Run, data_files, plain_columns
 from astra_data.dataset.statistics import Roundings
 
 RECORDED_TASK = "recorded.task_index"  # (T,) int64: LeRobot's task_index, where there are several tasks
@@ -113,6 +115,32 @@ def our_columns(recorded: Iterable[Column], *, has_tasks: bool) -> list[Column]:
 def next_state_of(state: Column) -> Column:
     """Return the column of next states, which are those of the following rows."""
     return replace(state, name=names.NEXT_STATE, meaning=f"{state.meaning or 'the state'}, one step later")
+
+
+def stored_features(folder: Path, declared: object, notes: list[str]) -> dict[str, Any]:
+    """Return the features `declared` with the types and sizes of the columns in the first file that can be read."""
+    features, schema = dict(declared) if isinstance(declared, dict) else {}, pa.schema([])
+    for path in data_files(folder):
+        with suppress(*UNREADABLE), open_parquet(path) as file:
+            schema = file.schema_arrow
+            break
+    for one in schema:
+        is_list = pa.types.is_fixed_size_list(one.type)
+        kind, size = (one.type.value_type, one.type.list_size) if is_list else (one.type, 1)
+        dtype, feature = {"double": "float64", "float": "float32"}.get(str(kind), str(kind)), features.get(one.name)
+        if not (stored := plain_columns({one.name: {"dtype": dtype, "shape": [size]}})[0]):
+            continue
+        found = dict(feature) if isinstance(feature, dict) else {}
+        if plain_columns({one.name: feature})[0] != stored:
+            notes.append(f"{one.name} is {size} {dtype}, as stored: {INFO_PATH} has {feature!r:.80}")
+            found |= {"dtype": dtype, "shape": [size], "names": None}
+        try:
+            Column.from_feature(one.name, found | {"dtype": "float32", "names": None})
+        except BadInputError as error:
+            notes.append(f"what {INFO_PATH} says of units and roles is left out: {error}")
+            found.pop("astra", None)
+        features[one.name] = found
+    return features
 
 
 def declared_columns(folder: Path, info: Mapping[str, Any]) -> tuple[list[PlainColumn], list[Column], int]:

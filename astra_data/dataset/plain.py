@@ -275,12 +275,13 @@ def block_values(table: pa.Table, columns: Sequence[PlainColumn]) -> dict[str, A
     values = {}
     for column in columns:
         stored = table.column(column.name)
-        if pa.types.is_list(stored.type):
-            try:
+        try:
+            if pa.types.is_list(stored.type):
                 stored = stored.cast(column.arrow_type)
-            except pa.ArrowInvalid as error:
-                raise CorruptDatasetError(f"{column.name}: expected {column.size} values in every row") from error
-        values[column.name] = to_numpy(stored, column.size, column.dtype)
+            values[column.name] = to_numpy(stored, column.size, column.dtype)
+        except (pa.ArrowInvalid, CorruptDatasetError) as error:
+            why = error if isinstance(error, CorruptDatasetError) else f"expected {column.size} values in every row"
+            raise CorruptDatasetError(f"{column.name}: {why}") from error
     return values
 
 

@@ -22,7 +22,7 @@ from astra_data.dataset import format as layout
 from astra_data.dataset import plain
 from astra_data.dataset.cameras import Camera, clip_fault, decoded, read_cameras
 from astra_data.dataset.columns import RESERVED, SUCCESS, Array, Column, Episode, Scalar
-from astra_data.dataset.lerobot_recording import RecordedFiles, declared_columns, open_recording
+from astra_data.dataset.lerobot_recording import RecordedFiles, declared_columns, open_recording, stored_features
 from astra_data.dataset.parquet import read_arrays, read_blocks, rows_of, to_numpy
 from astra_data.dataset.statistics import ranges
 
@@ -461,6 +461,7 @@ def can_be_repaired(root: Path) -> bool:
     """Return whether columns and rate of the dataset in `root` are known, without which no value is."""
     info = plain.read_object(root / layout.INFO_PATH)
     try:
-        return not isinstance(info, str) and bool(declared_columns(root, info))
+        known = {} if isinstance(info, str) else {**info, "features": stored_features(root, info.get("features"), [])}
+        return bool(declared_columns(root, known))
     except CorruptDatasetError:
         return False

@@ -26,6 +26,7 @@ _log = logging.getLogger(__name__)
 _COMPARED = {"<=": le, ">=": ge, "==": eq, "!=": ne, "<": lt, ">": gt}
 _CONDITION = re.compile(r"\s*(.+?)\s*(<=|>=|==|!=|<|>)\s*(\S+)\s*")
 _OBSERVED = re.compile(r"(next\.)?observation\.")
+_FINEST = 100  # times the recorded rate
 
 
 def trim(
@@ -54,6 +55,8 @@ def trim(
         )
     condition = _condition(source, without) if without else None
     first, last = (round(seconds * source.info["fps"]) for seconds in (start_s, end_s))
+    if not (first or last or still or without):
+        raise BadInputError(f"trim: expected a step or more, {1 / source.info['fps']:g} s, got less")
 
     def kept(episode: Episode) -> Bools:
         left = np.zeros(len(episode), bool)
@@ -78,8 +81,10 @@ def resample(source: Dataset, fps: int, *, name: str | None = None, out: Path | 
     out, since steps of another length land elsewhere: pair it again. What is left of an episode after its last
     whole step adds its reward and ending to that step; an episode shorter than a step is left out.
     """
-    if fps < 1 or fps == source.info["fps"]:
-        raise BadInputError(f"resample: expected another rate than {source.info['fps']} per second, got {fps}")
+    most = _FINEST * source.info["fps"]
+    if not 1 <= fps <= most or fps == source.info["fps"]:
+        rates = f"another rate than {source.info['fps']} per second, from 1 to {most}"
+        raise BadInputError(f"resample: expected {rates}, got {fps}")
     if source.cameras and source.info["fps"] % fps:
         raise BadInputError(
             f"resample: {source.reference} has cameras, whose pictures are not interpolated: expected a rate that "
@@ -88,7 +93,10 @@ def resample(source: Dataset, fps: int, *, name: str | None = None, out: Path | 
     schema = [column for column in source.schema if not column.name.startswith("abstract.")]
     slower = (slow for episode in source.episodes() if (slow := _resampled(episode, schema, source.info["fps"], fps)))
     config = {"fps": fps, "from_fps": source.info["fps"]}
-    return _write(source, "columns", schema, slower, fps, stage="resample", config=config, name=name, out=out)
+    made = _write(source, "columns", schema, slower, fps, stage="resample", config=config, name=name, out=out)
+    if paired := [column.name for column in source.schema if column not in schema]:
+        _log.warning("left out, since steps of another length land elsewhere: %s; pair it again", ", ".join(paired))
+    return made
 
 
 def _write(

@@ -144,7 +144,7 @@ def successor(
     begins with version 1.0.0. With `out`, the version does not depend on those at home.
     """
     kept = {key: source[key] for key in ("seeds", "environment", "simulator")}
-    name = name or source["name"]
+    name = source["name"] if name is None else name
     taken = versions_at_home(name) if out is None else []
     before = Version.parse(source["version"]) if name == source["name"] else max(taken, default=None)
     version = before.next(change, taken) if before else Version(1, 0, 0)

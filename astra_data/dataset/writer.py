@@ -89,6 +89,8 @@ class DatasetWriter:
             ),
             f"task {task!r}, expected text of valid characters": isinstance(task, str) and is_text(task),
         }
+        around = [folder for folder in root.absolute().parents if (folder / layout.INFO_PATH).is_file()]
+        checks |= {f"expected a folder outside of the dataset {folder}": False for folder in around}
         if faults := unmet(checks):
             raise BadInputError(f"Dataset {root}: {'; '.join(faults)}.")
         self.root = root

@@ -1,6 +1,5 @@
 """Export of datasets to the formats of other libraries, whole or not at all."""
 
-import io
 import json
 import logging
 from collections.abc import Callable, Iterator
@@ -28,7 +27,7 @@ _log = logging.getLogger(__name__)
 def export(dataset: Dataset, out: Path, *, format: str) -> None:
     """Write `dataset` to a new `out`, in the layout of the library `format`; rewards are 0 where it has none."""
     if format not in EXPORTERS:
-        raise BadInputError(f"format '{format}': unknown{did_you_mean(format, EXPORTERS)}")
+        raise BadInputError(f"format '{format}': unknown{did_you_mean(format, [*EXPORTERS, 'card'])}")
     if missing := [name for name in NEEDED if name not in dataset.features]:
         raise BadInputError(f"{dataset.reference} cannot be exported: it lacks {', '.join(missing)}")
     if REWARD not in dataset.features:
@@ -188,7 +187,9 @@ def _episodes(dataset: Dataset) -> Iterator[tuple[int, Episode, dict[str, Array]
 @contextmanager
 def hdf5_file(path: Path, *, track_order: bool = False) -> Iterator[Any]:
     """Yield a new HDF5 file, written to `path` once it is whole: HDF5 itself crashes where a disk fails."""
-    content = io.BytesIO()
-    with optional("h5py").File(content, "w", track_order=track_order) as file:
+    # In memory by HDF5's own driver: one for Python's files may crash once the collector frees them.
+    with optional("h5py").File(path, "w", driver="core", backing_store=False, track_order=track_order) as file:
         yield file
-    path.write_bytes(content.getbuffer())
+        file.flush()
+        content = file.id.get_file_image()
+    path.write_bytes(content)

@@ -98,6 +98,8 @@ def test_findings_are_shown_and_written(tmp_path: Path) -> None:
     assert finding["episodes"] == [*range(21, 30)] and f"astra-data filter '{logs}' --without 21" in finding["advice"]
     shown = "warning: " + finding["what"] + " (episodes 21, 22, 23, 24, 25 and 4 more): " + finding["advice"]
     assert lines[-5:] == ["check-up", *found["summary"], shown, f"written: {tmp_path / 'found.json'}"][-5:]
+    again = call("inspect", str(logs), "--json", str(tmp_path / "found.json"))
+    assert "found.json exists already" in str(again.exception)
 
 
 def test_what_does_not_fit_is_told(tmp_path: Path) -> None:
@@ -218,7 +220,7 @@ def test_validate_and_repair(
     [
         ("{", "meta/info.json is no JSON object"),
         ("{}", "fps is None"),
-        ('{"fps": 10, "features": {}}', "data_path is None"),
+        ('{"fps": 0.5, "features": {}}', "data_path is None"),
     ],
 )
 def test_repair_is_not_advised_where_it_cannot_help(

@@ -31,7 +31,7 @@ def test_a_description_is_completed_with_defaults_packages_and_the_machine() -> 
 @pytest.mark.parametrize(
     ("change", "fault"),
     [
-        ({"name": "../walks"}, "name '../walks', expected up to 200 letters"),
+        ({"name": "../walks"}, "name '../walks', expected up to 200 of A-Z"),
         ({"version": "1.0"}, "version '1.0', expected three numbers"),
         ({"stage": ""}, "stage '', expected the name of the stage"),
         ({"parents": [{"name": "raw"}]}, "expected name, version and hash"),

@@ -7,7 +7,7 @@ import pytest
 from fake_dataset import COLUMNS, DESCRIPTION, assert_same, fake_episode, write_fake, writer
 
 from astra_data.core.errors import BadInputError
-from astra_data.dataset.columns import STATE, Column
+from astra_data.dataset.columns import REWARD, STATE, Column, Episode
 from astra_data.dataset.edit import delete, filter_episodes, merge, share, subset
 from astra_data.dataset.reader import Dataset
 
@@ -108,6 +108,10 @@ def test_percent_is_of_a_given_number_and_nothing_is_repeated(forty: Dataset, tm
         subset(forty, episodes=3, percent=3, out=tmp_path / "both")
     with pytest.raises(BadInputError, match=r"a percentage \(optionally with --of\)"):
         subset(forty, episodes=3, of=20, out=tmp_path / "of-what")
+    with pytest.raises(BadInputError, match=r"name '', expected up to 200 of A-Z"):
+        subset(forty, episodes=3, name="", out=tmp_path / "nameless")
+    with pytest.raises(BadInputError, match="expected a folder outside of the dataset"):
+        subset(forty, episodes=3, out=forty.root / "data/new")
     assert [path.name for path in tmp_path.iterdir()] == ["more"]
 
 
@@ -147,10 +151,22 @@ def test_filters_that_cannot_work_are_refused(forty: Dataset, tmp_path: Path) ->
         filter_episodes(forty, out=tmp_path / "set")
     with pytest.raises(BadInputError, match="none of its 40 episodes would be left"):
         filter_episodes(forty, min_length=100, out=tmp_path / "set")
-    with writer(tmp_path / "bare") as open_writer:
-        open_writer.add(fake_episode(1, 3).__class__(1, fake_episode(1, 3).columns))
+    with pytest.raises(BadInputError, match="expected numbers, got nan"):
+        filter_episodes(forty, max_return=float("nan"), out=tmp_path / "set")
+    columns = fake_episode(1, 3).columns
+    with writer(tmp_path / "bare", columns=[column for column in COLUMNS if column.name != REWARD]) as open_writer:
+        open_writer.add(Episode(1, {name: values for name, values in columns.items() if name != REWARD}))
     with pytest.raises(BadInputError, match="have no 'return': run `astra-data label --task`"):
         filter_episodes(Dataset.open(tmp_path / "bare"), min_return=0, out=tmp_path / "set")
+
+
+def test_returns_that_are_not_told_are_sums_of_rewards(tmp_path: Path) -> None:
+    with writer(tmp_path / "bare") as open_writer:
+        for uid, steps in ((3, 2), (1, 4), (2, 3)):
+            open_writer.add(Episode(uid, {**fake_episode(uid, steps).columns, REWARD: np.ones(steps, np.float32)}))
+    bare = Dataset.open(tmp_path / "bare")
+    assert uids(filter_episodes(bare, min_return=3, out=tmp_path / "set")) == {1, 2}
+    assert uids(filter_episodes(bare, max_return=2, out=tmp_path / "low")) == {3}
 
 
 def test_merge_puts_one_after_the_other(tmp_path: Path) -> None:

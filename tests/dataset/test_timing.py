@@ -99,6 +99,7 @@ def test_still_ends_go_and_pauses_stay(tmp_path: Path) -> None:
         ({}, "expected a time of 0 s or more at the start or the end, --still or --without a condition, got none"),
         ({"start_s": float("inf")}, "got --start inf and --end 0"),
         ({"end_s": float("nan")}, "got --start 0 and --end nan"),
+        ({"start_s": 0.02, "end_s": 0.02}, "expected a step or more, 0.05 s"),
         ({"start_s": 99.0}, "nothing of its 5 episodes would be left"),
         ({"without": "mode"}, "expected a condition such as 'v < 0.05'"),
         ({"without": "x < near"}, "expected a condition such as 'v < 0.05'"),
@@ -133,7 +134,9 @@ def turning(folder: Path, fps: int, steps: int) -> Dataset:
 
 
 @pytest.mark.parametrize(("recorded", "fps", "steps"), [(62, 10, 12), (62, 25, 31), (62, 100, 124), (61, 100, 122)])
-def test_states_at_another_rate_are_where_the_robot_was(tmp_path: Path, recorded: int, fps: int, steps: int) -> None:
+def test_states_at_another_rate_are_where_the_robot_was(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, recorded: int, fps: int, steps: int
+) -> None:
     root = resample(turning(tmp_path / "logs", 50, recorded), fps, out=tmp_path / "out")
     found, (episode,) = Dataset.open(root), made(root)
     assert found.info["fps"] == fps and len(episode) == steps
@@ -150,7 +153,7 @@ def test_states_at_another_rate_are_where_the_robot_was(tmp_path: Path, recorded
     np.testing.assert_array_equal(episode.columns[ACTION], np.floor(time_s * 50 + 1e-6))
     assert episode.columns[REWARD].sum() == recorded == episode.metadata["return"]
     assert episode.columns[TERMINATED].tolist() == [*[False] * (len(episode) - 1), True]
-    assert "abstract.state" not in found.features
+    assert "abstract.state" not in found.features and caplog.messages[-1].endswith("abstract.state; pair it again")
 
 
 def test_rewards_and_endings_are_those_of_all_steps_within(tmp_path: Path) -> None:
@@ -166,9 +169,9 @@ def test_without_next_states_the_last_state_has_no_step_after_it(tmp_path: Path)
     assert episode.columns[STATE].tolist() == [0, 2, 4]
 
 
-@pytest.mark.parametrize("fps", [20, 0, -5])
+@pytest.mark.parametrize("fps", [20, 0, -5, 2001])
 def test_another_rate_is_one(source: Dataset, fps: int, tmp_path: Path) -> None:
-    with pytest.raises(BadInputError, match=f"expected another rate than 20 per second, got {fps}"):
+    with pytest.raises(BadInputError, match=f"expected another rate than 20 per second, from 1 to 2000, got {fps}"):
         resample(source, fps, out=tmp_path / "out")
 
 

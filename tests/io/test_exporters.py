@@ -1,3 +1,4 @@
+import gc
 import json
 import sys
 from pathlib import Path
@@ -227,4 +228,8 @@ def test_minari_refuses_next_states_that_do_not_follow(tmp_path: Path) -> None:
 
 def test_the_failure_of_a_disk_is_raised() -> None:
     with pytest.raises(OSError, match="No space left"), hdf5_file(FULL) as file:
-        file["a"] = 1
+        file["a"] = np.zeros(100_000)
+        loop: list[object] = [file]
+        loop.append(loop)
+    del file, loop
+    gc.collect()  # which does not crash

@@ -123,6 +123,8 @@ def _info_faults(info: Mapping[str, Any], report: Report) -> list[plain.PlainCol
         f"features is {features!r}, expected an object": isinstance(features, dict),
         f"data_path is {path!r}, {inside}": plain.is_data_path(path),
     }
+    listed = features.items() if isinstance(features, dict) else ()
+    checks |= {f"{name} is {one!r} in features, expected an object": isinstance(one, dict) for name, one in listed}
     for fault in unmet(checks):
         report.fault(layout.INFO_PATH, f"{layout.INFO_PATH}: {fault}")
     if not isinstance(features, dict) or not all(list(checks.values())[1:]):
@@ -238,7 +240,7 @@ class EpisodeChecks:
         counts = {"episodes": report.episodes, "frames": report.frames, "tasks": len(self.tasks)}
         for key, count in counts.items():
             if (found := self.info.get(f"total_{key}")) != count:
-                report.fault("counts", f"total_{key} is {found}, expected {count}")
+                report.fault("counts", f"total_{key} is {found!r}, expected {count}")
         if not report.frames:
             report.fault("values", "there are no steps")
         elif not self.digests:
@@ -278,7 +280,7 @@ class EpisodeChecks:
             compared["tasks"] = (listed, present)
         for key, (found, expected) in compared.items():
             if found != expected:
-                fault = f"meta/episodes: {key} of episode {number} is {found}, expected {expected}"
+                fault = f"meta/episodes: {key} of episode {number} is {found!r}, expected {expected!r}"
                 self.report.fault("meta/episodes", fault)
         if not self.digests:
             statistics = dict(zip(layout.STATISTICS, episode_statistics(run.columns.values()), strict=True))

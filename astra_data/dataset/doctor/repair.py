@@ -203,12 +203,14 @@ def remains_of(folder: Path, sources: Sequence[Dataset], notes: list[str]) -> Re
     info = read_object(folder / layout.INFO_PATH)
     if isinstance(info, str):
         raise CorruptDatasetError(f"{folder}: {layout.INFO_PATH} {info}; without it columns and fps are unknown")
+    info = {**info, "features": lerobot.stored_features(folder, info.get("features"), notes)}
     columns, specs, fps = lerobot.declared_columns(folder, info)
     if sources and names.EPISODE_UID not in info["features"]:
         raise BadInputError(f"{folder} has no column {names.EPISODE_UID}, by which it joins {sources[0].reference}")
     tasks, rows = read_tasks(folder), lerobot.Rows({column.name: column for column in columns}, fps)
     has_ours = (folder / layout.OUR_FOLDER).is_dir()
-    is_ours = names.EPISODE_UID in rows.stored or has_ours or not rows.dropped or lerobot.lacking(specs)
+    had_none = sources and names.NEXT_STATE not in sources[0].features
+    is_ours = has_ours or had_none or not rows.dropped or lerobot.lacking(specs)
     if not is_ours:
         specs = lerobot.our_columns(specs, has_tasks=not isinstance(tasks, str) and len(tasks) > 1)
     if is_format_2(folder):

@@ -78,12 +78,13 @@ def whole_runs(
             notes.append(_lost(episode, number - 1))
             episode, row = number, first
         faults = [fault for _, fault in plain.run_faults(run, number=episode, row=row, fps=fps)]
-        if (place := places.get(episode)) and place.length != len(run):
+        altered = altered_columns(run.columns, episode, digests)
+        if (place := places.get(episode)) and place.length != len(run) and (altered or episode >= most or not digests):
             faults.append(f"it has {len(run)} frames, expected {place.length}")
         if episode >= most and digests:
             faults.append(f"expected {most} episodes")
         faults += plain.flag_faults(run.columns, f"episode {episode} ")
-        if altered := altered_columns(run.columns, episode, digests):
+        if altered:
             faults.append(alteration(altered, run.path, run.row, len(run), episode))
         uid = int(run.columns.get(names.EPISODE_UID, [episode])[0])
         if uid < 0 or (uid in uids and not repeated):
@@ -151,10 +152,25 @@ def _row_groups(file: pq.ParquetFile, columns: Sequence[plain.PlainColumn]) -> I
         try:
             table = file.read_row_group(group, columns=[column.name for column in columns], use_threads=False)
             if not plain.schema_faults(table.schema, columns):
+                table = _filled(table, columns)
                 plain.block_values(table, columns)
             yield group, table
         except (*UNREADABLE, CorruptDatasetError) as error:
             yield group, in_short(error)
+
+
+def _filled(table: pa.Table, columns: Sequence[plain.PlainColumn]) -> pa.Table:
+    """Return `table` with NaN for floats that are missing, so that only their episodes are left out."""
+    for column in columns:
+        rows = table.column(column.name)
+        parts = [rows, *(chunk.flatten() for chunk in rows.chunks if column.size > 1)]
+        if np.dtype(column.dtype).kind == "f" and any(part.null_count for part in parts):
+            lists = [(row or [None] * column.size) if column.size > 1 else [row] for row in rows.to_pylist()]
+            known = [[np.nan if value is None else value for value in row] for row in lists]
+            made = known if column.size > 1 else [value for [value] in known]
+            at = table.schema.get_field_index(column.name)
+            table = table.set_column(at, column.name, pa.array(made, column.arrow_type))
+    return table
 
 
 class _Page(NamedTuple):

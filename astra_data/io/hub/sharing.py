@@ -81,7 +81,7 @@ def _refuse_change(there: stores.RemoteFolder, local: Dataset) -> None:
     if others := sorted(path for path in ours.keys() | listed if ours.get(path) != listed.get(path)):
         raise BadInputError(
             f"{there.name} holds other values or was altered: {stores.SUMS_PATH} there differs in "
-            f"{', '.join(others)}. Versions never change: give the dataset a new one, or push elsewhere."
+            f"{', '.join(others)}. Versions never change: make it again with another --name, or push elsewhere."
         )
     if changed := [path for path, digest in ours.items() if there.differs(path, local.root / path, digest)]:
         raise SharingError(
@@ -225,7 +225,7 @@ def _check(folder: Path, sums: Mapping[str, str], description: Mapping[str, Any]
             (folder / path).unlink(missing_ok=True)
         raise SharingError(
             f"{name}: {', '.join(wrong)} do not have the sha256 in {stores.SUMS_PATH}: the download was "
-            "cut off, or they were altered there; run the same command again."
+            "cut off: run the same command again; if it says so again, they were altered there: push another version."
         )
     try:
         dataset = Dataset.open(folder)

@@ -358,8 +358,10 @@ def explained(place: str) -> Iterator[None]:
         raise
     except PermissionError as error:
         raise SharingError(f"{place}: no rights to do this ({error}); check the credentials.") from error
-    except FileNotFoundError as error:
-        raise SharingError(f"{place}: does not exist ({error}); check the spelling.") from error
+    except (FileNotFoundError, NotADirectoryError) as error:
+        raise SharingError(
+            f"{place}: does not exist or is no folder ({error}); check the spelling, or push again what is missing."
+        ) from error
     except Exception as error:
         raise (_of_the_hub(place, error) if "Hugging Face Hub" in place else None) or SharingError(
             f"{place}: {type(error).__name__}: {error}; check the address, the credentials and the network, "

@@ -405,7 +405,7 @@ def _description(world: Task, config: CollectConfig, seed: int, name: str | None
     saved = {f"{kind}_sha256": file_digest(path) for kind, path in files if path.is_file()}
     behaviors = config.behavior + ("-and-random" if config.random_share else "")
     return {
-        "name": name or f"{world.name}-{behaviors}-seed{seed}".replace("_", "-"),
+        "name": f"{world.name}-{behaviors}-seed{seed}".replace("_", "-") if name is None else name,
         "version": "1.0.0",
         "stage": "collect",
         "config": config.model_dump(mode="json") | saved,

@@ -70,7 +70,7 @@ def test_a_copy_without_its_description_is_not_whole(tmp_path: Path) -> None:
         (alter(EPISODES, "dataset_from_index", 1, 9), ["dataset_from_index of episode 1 is 9, expected 7"]),
         (
             alter(EPISODES, "data/file_index", 1, 4),
-            ["the file of episode 1 is data/chunk-000/file-004.parquet, expected data/chunk"],
+            ["the file of episode 1 is 'data/chunk-000/file-004.parquet', expected 'data/chunk"],
         ),
         (drop_last_row(DATA), ["total_frames is 55, expected 54"]),
         (retype(EPISODES, "tasks", 7), ["tasks of episode 0 is 7, expected {'run'}"]),
@@ -87,6 +87,8 @@ def test_a_copy_without_its_description_is_not_whole(tmp_path: Path) -> None:
             edit("meta/info.json", total_frames=1, total_episodes=2, total_tasks=3, codebase_version="v2.1"),
             ["is v2.1, expected v3.0", "total_frames is 1, expected 55", "total_episodes is 2", "total_tasks is 3"],
         ),
+        (edit("meta/info.json", features={"action": None}), ["action is None in features, expected an object"]),
+        (alter(DATA, "action", 9, None), ["action: expected 2 values in every row, some are missing"]),
         (edit("meta/info.json", data_path="../file.parquet"), ["expected a path inside the folder"]),
         (edit("meta/info.json", fps="20"), ["fps is '20', expected a positive number"]),
         (edit("meta/info.json", fps=2**31), ["expected a positive number below 2^31"]),

@@ -217,7 +217,9 @@ def test_metadata_is_joined_by_uid(tmp_path: Path) -> None:
     shutil.copytree(original.root, edited)
     shutil.rmtree(edited / "meta/astra")
     repair(edited, out=tmp_path / "alone")
-    assert Dataset.open(tmp_path / "alone").metadata == {}
+    assert Dataset.open(tmp_path / "alone").metadata == Dataset.open(edited).metadata  # of LeRobot: with next states
+    alone, before = (Dataset.open(at).columns([NEXT_STATE])[NEXT_STATE] for at in (tmp_path / "alone", edited))
+    np.testing.assert_array_equal(alone, before)
     repair(edited, out=tmp_path / "joined", like=original)
     joined = Dataset.open(tmp_path / "joined")
     assert (joined.metadata, joined.order) == (original.metadata, original.order)
@@ -237,8 +239,8 @@ def test_lists_without_a_size_are_read_as_lerobots_merge_writes_them(tmp_path: P
     pq.write_table(table.set_column(at, "action", pa.array(lists, pa.list_(pa.float32()))), root / DATA)
     shutil.rmtree(root / "meta/astra")
     assert check(root).faults == []
-    repair(root, out=tmp_path / "saved")
-    assert Dataset.open(tmp_path / "saved").content_hash == write_fake(tmp_path / "again").content_hash
+    repair(root, out=tmp_path / "saved", like=write_fake(tmp_path / "again"))
+    assert Dataset.open(tmp_path / "saved").content_hash == Dataset.open(tmp_path / "again").content_hash
     lists[9] = [1.0, 2.0, 3.0]
     lists[10] = [1.0]
     pq.write_table(table.set_column(at, "action", pa.array(lists, pa.list_(pa.float32()))), root / DATA)
@@ -286,6 +288,28 @@ def test_episodes_with_other_values_than_were_written_are_left_out(tmp_path: Pat
     assert saved.description["repaired"] == repaired.notes
     kept = [episode for number, episode in enumerate(fake_episodes()) if number not in (2, 3)]
     assert_same(saved.episodes(), kept)
+
+
+@pytest.mark.parametrize(
+    ("name", "feature"),
+    [
+        ("mode", None),
+        ("action", None),
+        ("action", {"dtype": "float31", "shape": [2], "names": ["x", "y"]}),
+        ("action", {"dtype": "float32", "shape": [3], "names": ["x", "y"]}),
+        ("observation.state", {"dtype": "float32", "shape": [3], "names": None, "astra": {"unit": ["m"]}}),
+        ("observation.state", {"dtype": "float32", "shape": [3], "names": None, "astra": "m"}),
+    ],
+)
+def test_columns_are_what_is_stored_whatever_info_says(tmp_path: Path, name: str, feature: object) -> None:
+    whole = write_fake(tmp_path / "set")
+    features = json.loads((whole.root / INFO_PATH).read_text())["features"]
+    changed = {key: one for key, one in (features | {name: feature}).items() if key != "mode" or name != "mode"}
+    edit(INFO_PATH, features=changed)(whole.root)
+    notes = repair(whole.root, out=tmp_path / "saved").notes
+    assert name in notes[0] and INFO_PATH in notes[0] and "none" not in "".join(notes)
+    saved = Dataset.open(tmp_path / "saved")
+    assert saved.content_hash == whole.content_hash and saved.metadata == whole.metadata
 
 
 def test_altered_metadata_is_not_taken_over(tmp_path: Path) -> None:

@@ -35,6 +35,9 @@ def salvaged(root: Path, digests: Digests | None = None) -> tuple[list[int], lis
     [
         # Whatever is wrong with an episode costs it alone.
         (alter(DATA, "action", 9, [np.nan, 0]), [0, 1, 3, 4], "left out episode 2: action is nan"),
+        (alter(DATA, "action", 9, None), [0, 1, 3, 4], "left out episode 2: action is nan"),
+        (alter(DATA, "action", 9, [0.5, None]), [0, 1, 3, 4], "left out episode 2: action is nan"),
+        (alter(DATA, "next.reward", 9, None), [0, 1, 3, 4], "left out episode 2: next.reward is nan"),
         (alter(DATA, "next.done", 9, True), [0, 1, 3, 4], "left out episode 2: next.done is True"),
         (alter(DATA, "episode_uid", 7, -5), [0, 2, 3, 4], "left out episode 1: its uid -5 is taken or neg"),
         (alter(DATA, "index", 9, 70), [0, 1, 3, 4], "left out episode 2: index is 70"),
@@ -62,6 +65,12 @@ def test_with_digests_an_altered_episode_costs_no_other(tmp_path: Path, damage: 
     uids, [note] = salvaged(dataset.root, digests)
     assert uids == [uid for number, uid in enumerate(UIDS) if number != 2]
     assert f"other values than were written in {DATA} rows 8 to 19 (episode 2)" in note
+
+
+def test_an_altered_length_costs_no_episode_whose_digests_agree(tmp_path: Path) -> None:
+    dataset = write_fake(tmp_path / "set")
+    alter(EPISODES, "length", 2, 11)(dataset.root)
+    assert salvaged(dataset.root, read_digests(dataset.root, dataset.features)) == (UIDS, [])
 
 
 def deface(path: Path, group: int, column: str) -> None:
