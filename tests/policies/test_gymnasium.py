@@ -1,4 +1,5 @@
 from dataclasses import replace
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -14,10 +15,12 @@ from astra_data.grounding.model import GroundingModel, GroundingShape
 from astra_data.grounding.simulator import NO_GROUNDING
 from astra_data.policies.gymnasium import Array, BatchedVectorEnv, SeededSimulatorEnv, SingleEnv
 from astra_data.policies.simulator_env import SimulatorEnv
-from astra_data.policies.stable_baselines import StableBaselinesEnv
 from astra_data.robots.registry import TASKS
+from astra_data.worlds.user_code import user_object
 
 gymnasium.register_envs(astra_data.envs)
+SB3_PPO = Path(__file__).parents[2] / "recipes/examples/methods/sb3_ppo.py"
+StableBaselinesEnv = user_object(f"{SB3_PPO}:StableBaselinesEnv")
 
 NAMES = [f"astra_data/{world}{maze}-v0" for world in ("AntMaze", "PointMaze") for maze in ("UMaze", "Long")]
 

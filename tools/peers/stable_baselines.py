@@ -25,12 +25,13 @@ from astra_data.pipeline.recipe import Recipe
 from astra_data.policies import ppo
 from astra_data.policies.gymnasium import Array, BatchedVectorEnv, SeededSimulatorEnv, SingleEnv
 from astra_data.policies.simulator_env import SimulatorEnv
-from astra_data.policies.stable_baselines import StableBaselinesEnv
 from astra_data.policies.train import PpoTrainConfig
 from astra_data.robots.registry import TASKS
+from astra_data.worlds.user_code import user_object
 
 RECIPE = Path(__file__).parents[2] / "recipes" / "antmaze_long.toml"
 SINGLE_WORLDS = 16
+StableBaselinesEnv = user_object(f"{RECIPE.parent}/examples/methods/sb3_ppo.py:StableBaselinesEnv")
 
 
 class Algorithm(StrEnum):

@@ -4,11 +4,51 @@ import numpy as np
 from gymnasium.spaces import Box
 from stable_baselines3 import PPO
 from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.vec_env import VecEnv
 
 from astra_data.methods.astra import NAS
 from astra_data.methods.method import Method
-from astra_data.policies.stable_baselines import StableBaselinesEnv
 from astra_data.policies.train import UserLearner
+
+
+class StableBaselinesEnv(VecEnv):
+    """A vector environment of Gymnasium as one of Stable-Baselines3, whose interface is another."""
+
+    def __init__(self, env):
+        self.env = env
+        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
+
+    def reset(self):
+        observation, _ = self.env.reset(seed=self._seeds[0])
+        self._reset_seeds()
+        return observation
+
+    def step_async(self, actions):
+        self.actions = actions
+
+    def step_wait(self):
+        observation, reward, terminated, truncated, infos = self.env.step(self.actions)
+        done = terminated | truncated
+        facts = [{} for _ in done]
+        for row in np.flatnonzero(done):
+            late = bool(truncated[row] and not terminated[row])
+            facts[row] = {"terminal_observation": infos["final_obs"][row], "TimeLimit.truncated": late}
+        return observation, reward, done, facts
+
+    def close(self):
+        pass
+
+    def get_attr(self, attr_name, indices=None):
+        return [None] * self.num_envs
+
+    def set_attr(self, attr_name, value, indices=None):
+        raise NotImplementedError("rows of one batch have no attributes of their own")
+
+    def env_method(self, method_name, *args, indices=None, **kwargs):
+        raise NotImplementedError("rows of one batch have no methods of their own")
+
+    def env_is_wrapped(self, wrapper_class, indices=None):
+        return [False] * self.num_envs
 
 
 class Sb3Policy:
