@@ -55,7 +55,8 @@ def disk_error(error: Exception) -> DiskError | None:
 
 
 def _report(fault: str, code: int) -> str:
-    why, advice = _OF_THE_DISK.get(code, (os.strerror(code).lower(), "choose another place"))
+    in_the_way = "a file is where a folder has to be" if code in (errno.EEXIST, errno.ENOTDIR) else None
+    why, advice = _OF_THE_DISK.get(code, (in_the_way or os.strerror(code).lower(), "choose another place"))
     return f"{fault}: {why}. What was finished before is safe: {advice}, then run the same command again."
 
 

@@ -233,6 +233,12 @@ def test_an_error_inside_is_not_swallowed_and_leaves_nothing(tmp_path: Path) -> 
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_file_is_no_folder(tmp_path: Path) -> None:
+    (tmp_path / "log").touch()
+    with pytest.raises(DiskError, match=r"set cannot be written: a file is where a folder has to be"):
+        durable.write_file(tmp_path / "log/set", "x")
+
+
 def test_nothing_is_overwritten(tmp_path: Path) -> None:
     target = tmp_path / "set"
     with durable.atomic_folder(target) as path:
