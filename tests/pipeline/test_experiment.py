@@ -46,7 +46,7 @@ def borrowed(base: Path, text: str) -> set[str]:
         ("", "collect pair ground train align evaluate"),
         ("seeds = [1]\nmethods = ['follower']\n[report]\ntrajectory_episodes = 2\n", "collect pair evaluate"),
         ("[evaluate]\nepisodes = 2\n", "collect pair ground train align"),
-        ("[train]\ntries = 2\n", "collect pair ground align"),
+        ("[train]\ntries = 3\n", "collect pair ground align"),
         ("[align]\nupdates = 2\n", "collect pair ground train"),
         ("[ground]\nupdates = 2\n", "collect pair"),
         ("[collect]\nepisodes = 2\n", ""),
