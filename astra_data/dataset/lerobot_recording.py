@@ -133,7 +133,7 @@ def stored_features(folder: Path, declared: object, notes: list[str]) -> dict[st
         found = dict(feature) if isinstance(feature, dict) else {}
         if plain_columns({one.name: feature})[0] != stored:
             notes.append(f"{one.name} is {size} {dtype}, as stored: {INFO_PATH} has {feature!r:.80}")
-            found |= {"dtype": dtype, "shape": [size], "names": None}
+            found |= {"dtype": dtype, "shape": [size]}
         try:
             Column.from_feature(one.name, found | {"dtype": "float32", "names": None})
         except BadInputError as error:

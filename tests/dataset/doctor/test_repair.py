@@ -310,6 +310,7 @@ def test_columns_are_what_is_stored_whatever_info_says(tmp_path: Path, name: str
     assert name in notes[0] and INFO_PATH in notes[0] and "none" not in "".join(notes)
     saved = Dataset.open(tmp_path / "saved")
     assert saved.content_hash == whole.content_hash and saved.metadata == whole.metadata
+    assert name != "action" or saved.features["action"]["names"] == (feature and ["x", "y"])
 
 
 def test_altered_metadata_is_not_taken_over(tmp_path: Path) -> None:
