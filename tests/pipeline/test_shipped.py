@@ -74,6 +74,7 @@ def test_the_command_line_lists_and_copies(tmp_path: Path) -> None:
     assert (tmp_path / "quickstart.toml").is_file()
 
 
+@pytest.mark.usefixtures("forgotten_methods")
 def test_published_results_are_of_their_recipe_and_can_be_added_to(tmp_path: Path) -> None:
     places = [*(RECIPES / "results").glob("*/results.json")]
     assert places
