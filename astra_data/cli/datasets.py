@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from astra_data.cli import arguments
-from astra_data.core.durable import write_file
+from astra_data.core.durable import refuse_existing, write_file
 from astra_data.core.errors import AstraDataError, BadInputError, CorruptDatasetError
 from astra_data.core.naming import RUNS, first_few, printable
 
@@ -178,8 +178,8 @@ def inspect(
     from astra_data.dataset.inspection import inspect_dataset
     from astra_data.dataset.versions import open_dataset
 
-    if json is not None and json.exists():
-        raise BadInputError(f"{json} exists already; delete it or choose another file.")
+    if json is not None:
+        refuse_existing(json)
     found = open_dataset(dataset)
     inspection, checkup = inspect_dataset(found), check_up(found, quote(dataset))
     Console(soft_wrap=True).print(inspection_page(inspection, checkup))

@@ -14,6 +14,7 @@ from astra_data.core.naming import first_few
 from astra_data.dataset.columns import REWARD, Scalar, distinct_uids, renamed_metadata
 from astra_data.dataset.compare import schema_differences
 from astra_data.dataset.description import permutation
+from astra_data.dataset.inspection import outcome_of
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import next_version
 
@@ -195,10 +196,9 @@ def _facts(source: Dataset, key: str) -> Sequence[Scalar | None]:
         return [int(length) for length in source.lengths]
     if key == "success" and (successes := source.successes()) is not None:
         return successes
-    if key == "return" and key not in source.metadata and REWARD in source.features:
-        starts = np.cumsum([0, *source.lengths[:-1]])
-        return [float(paid) for paid in np.add.reduceat(source.columns([REWARD])[REWARD], starts)]
     if key not in source.metadata:
+        if key == "return" and REWARD in source.features:
+            return [outcome_of(episode.columns)[key] for episode in source.episodes([REWARD])]
         if key in ("success", "return"):
             raise BadInputError(f"the episodes of {source.reference} have no {key!r}: run `astra-data label --task`")
         known = ["length", *source.metadata]

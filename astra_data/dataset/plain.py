@@ -279,9 +279,10 @@ def block_values(table: pa.Table, columns: Sequence[PlainColumn]) -> dict[str, A
             if pa.types.is_list(stored.type):
                 stored = stored.cast(column.arrow_type)
             values[column.name] = to_numpy(stored, column.size, column.dtype)
-        except (pa.ArrowInvalid, CorruptDatasetError) as error:
-            why = error if isinstance(error, CorruptDatasetError) else f"expected {column.size} values in every row"
-            raise CorruptDatasetError(f"{column.name}: {why}") from error
+        except pa.ArrowInvalid as error:
+            raise CorruptDatasetError(f"{column.name}: expected {column.size} values in every row") from error
+        except CorruptDatasetError as error:
+            raise CorruptDatasetError(f"{column.name}: {error}") from error
     return values
 
 
