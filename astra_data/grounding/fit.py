@@ -91,7 +91,7 @@ class HistoryFit:
     def __call__(self, fitting: Fitting) -> "tuple[HistoryGrounding, dict[str, Any]]":
         """Return the grounding and its figures."""
         from astra_data.grounding.failures import failure_figures, fit_failures, has_failures
-        from astra_data.grounding.history import HistoryGrounding, fit_scatter
+        from astra_data.grounding.history import HistoryGrounding, fit_hits, fit_scatter
 
         task = fitting.task
         if self.reward and not fitting.training.has_rewards:
@@ -106,6 +106,8 @@ class HistoryFit:
         fitting = replace(fitting, training=training, held_out=held_out)
         corrects_reward = training.windows.own_reward is not None
         model, metrics = self._fitted(fitting, corrects_reward=corrects_reward)
+        if model.hits is not None:
+            fit_hits(model, training, fitting.seed)
         if self.reward and corrects_reward:
             model.shrink_reward(held_out.windows)
             metrics["reward_shrinkage"] = float(model.reward_shrinkage)

@@ -20,6 +20,8 @@ from astra_data.worlds.protocols import PlacedSimulator, keep_clear
 _MOST = 2.0  # of the logarithm of a scale: off the data no moment shall scatter by more than e² times the usual
 _DESCENT = DescentConfig(updates=500, learning_rate=2e-3)
 _BATCH = 2048
+_HITS_DESCENT, _HITS_DECAY, _HITS_BATCH = DescentConfig(updates=1500, learning_rate=2e-3), 0.01, 512
+ROLLS_M_S = 0.15  # balls that are measured to be slower lie
 _MOST_FORMS = 20_000
 _FAILURES, _SCATTER = "failures", "scatter"  # prefixes of the tensors and sizes of the two models in files
 
@@ -88,10 +90,29 @@ def fit_scatter(
     gains = usual.log() - _deviation(in_units).log() - log_scale.mean(0)
     kurtosis = in_units.pow(4).mean(0) / in_units.square().mean(0).square()
     scattered = usual > 0
+    if model.hits is not None:
+        scatters.usual[-2:] = 0.0  # hits are drawn by simulators
     return scatters, {
         "gain_nats": float(gains[scattered].sum()),
         "kurtosis": float(kurtosis[scattered].mean()) if scattered.any() else None,
     }
+
+
+def fit_hits(model: GroundingModel, training: PairedEpisodes, seed: int) -> None:
+    """Fit which share of the simulator's velocity of a ball comes true, to the steps in which it rolls there."""
+    assert model.hits is not None
+    torch.manual_seed(derive(seed, "hits"))
+    windows = training.windows
+    with torch.no_grad():
+        latent, _ = model.encode(windows)
+        inputs = training.steps(model.correction_inputs(latent, windows.action, windows.simulated_next))
+    simulated, recorded = (training.steps(one)[:, -2:] for one in (windows.simulated_next, windows.next_state))
+    rolls = (simulated.norm(dim=-1) > ROLLS_M_S).nonzero().squeeze(1)
+    descent = Descent(model.hits, _HITS_DESCENT, weight_decay=_HITS_DECAY)
+    while len(rolls) and not descent.is_over:
+        rows = rolls[torch.randint(len(rolls), (_HITS_BATCH,), device=rolls.device)]
+        share = 2.0 * model.hits(inputs[rows]).sigmoid()
+        descent.update((share * simulated[rows] - recorded[rows]).square().sum(-1).mean())
 
 
 @torch.no_grad()

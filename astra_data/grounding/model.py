@@ -40,6 +40,11 @@ class GroundingShape:
     log_variance_bounds: tuple[float, float] = (-6.0, 2.0)
     encoder: str = HistoryEncoder.kind  # see `ENCODERS`
 
+    @property
+    def ball_rolls(self) -> bool:
+        """Whether states end with a ball's position and velocity."""
+        return self.ball_index is not None and self.ball_index + 4 == self.state_size
+
 
 class GroundingModel(nn.Module):
     """ψ^s, P_lat, R_pred and f_abs on one history encoder; scales are buffers, so that files hold them."""
@@ -57,9 +62,11 @@ class GroundingModel(nn.Module):
         self.latent_dynamics = mlp((latent + actions, *heads, 2 * latent))
         self.reward_head = mlp((latent + actions, *heads, rewards))
         self.correction = mlp((latent + actions + features, *heads, states))
+        self.hits = mlp((latent + actions + features, *heads, 1)) if shape.ball_rolls else None
         # An untrained correction is the identity: the raw simulator.
-        for parameter in list(self.correction.parameters())[-2:]:
-            nn.init.zeros_(parameter)
+        for network in (self.correction, *([self.hits] if self.hits else [])):
+            for parameter in list(network.parameters())[-2:]:
+                nn.init.zeros_(parameter)
         self.target_encoder = copy.deepcopy(self.encoder).requires_grad_(False)
         self.state_mean, self.state_std = nn.Buffer(torch.zeros(states)), nn.Buffer(torch.ones(states))
         self.goal_mean, self.goal_std = nn.Buffer(torch.zeros(shape.goal_size)), nn.Buffer(torch.ones(shape.goal_size))
@@ -137,8 +144,12 @@ class GroundingModel(nn.Module):
 
     def corrected(self, inputs: Tensor, simulated_next: Tensor) -> Tensor:
         """Return what `correct` does, given its `correction_inputs` (..., I)."""
-        correction: Tensor = self.correction(inputs)
-        return simulated_next + correction * self.correction_std
+        corrected: Tensor = simulated_next + self.correction(inputs) * self.correction_std
+        if self.hits is None:
+            return corrected
+        # Whether a ball is hit is a matter of centimeters: the share of the simulator's velocity that comes true.
+        rolling = 2.0 * self.hits(inputs).sigmoid() * simulated_next[..., -2:]
+        return torch.cat([corrected[..., :-2], rolling], dim=-1)
 
     def correction_inputs(self, latent: Tensor, action: Tensor, simulated_next: Tensor) -> Tensor:
         """Return what the correction sees of a step, (..., I)."""
@@ -171,8 +182,10 @@ class GroundingModel(nn.Module):
             parts["reward"] = 0.5 * _masked_mean((normal - true).square().sum(-1), windows.goes_on * mask)
             total = total + weights.reward * parts["reward"]
         corrected = self.correct(latent, action, windows.simulated_next)
-        error = ((corrected - windows.next_state) / self.correction_std).square().mean(-1)
-        parts["state"] = _masked_mean(error, mask)
+        error = ((corrected - windows.next_state) / self.correction_std).square()
+        if self.hits is not None:  # hits are too few to be learned beside the rest: see `fit_hits`
+            error = error[..., :-2]
+        parts["state"] = _masked_mean(error.mean(-1), mask)
         total = total + weights.state * parts["state"]
         return total, parts
 

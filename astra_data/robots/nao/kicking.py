@@ -19,9 +19,9 @@ BALL_RADIUS_M = 0.05  # of the same ball
 _KICKS_ABOVE = 0.5  # a third entry of a command above this asks for a kick
 _LIES_M_S = 0.15  # a slower ball lies: it would roll for 4 cm at most, and estimates of its speed are never quite zero
 _LEAVES_M_S = 0.5  # least speed with which corrections set a ball rolling that lay, as the NAO's kicks did
-_NOTHING_M_S = 0.05  # corrections to less than this set no ball rolling: scatter alone is as fast
+_SEEN_M_S = 0.2  # speed at which balls that were hit are first measured: they began to roll within the step
 _TURN_RAD = 0.4  # deviation of the ways in which hit balls leave from the simulator's, as in recorded kicks of the NAO
-_FADES = 0.75  # share of the evidence of a hit that counts in the next step: a foot meets the ball within four steps
+_FADES = 0.9  # share of the evidence of a hit that counts in the next step: who kicks on seldom hits later
 _NEAR_M = (0.18, 0.5)  # distances from the ball at which recorded episodes begin; a foot reaches as far as the first
 
 
@@ -149,9 +149,9 @@ class BallAgent(PlanarStates):
         slowed_m_s = self._deceleration_m_s2 * self.period_s
         leaving = (speed + slowed_m_s).clamp_min(_LEAVES_M_S * lay)
         rolled = torch.cat(roll(ball, direction * leaving, self.period_s, self._deceleration_m_s2), dim=-1)
-        touched = self._rolls & lay & (speed > _NOTHING_M_S)
+        touched = self._rolls & lay
         needed, evidence = self.memory.split(1, dim=-1)
-        evidence = _FADES * evidence + touched * speed / (leaving - slowed_m_s).clamp_min(_NOTHING_M_S)
+        evidence = _FADES * evidence + touched * speed / _SEEN_M_S
         rolls = torch.where(lay, touched & (evidence > needed), self._rolls & (speed > _LIES_M_S))
         undecided = self._undecided(self.num_envs)
         self.memory = torch.where(rolls, undecided, torch.cat([needed, evidence], dim=-1))
