@@ -62,6 +62,8 @@ class GroundingModel(nn.Module):
         self.latent_dynamics = mlp((latent + actions, *heads, 2 * latent))
         self.reward_head = mlp((latent + actions, *heads, rewards))
         self.correction = mlp((latent + actions + features, *heads, states))
+        # Hits are too few to be learned beside the rest: see `fit_hits`.
+        self.corrected_size = states - 2 if shape.ball_rolls else states
         self.hits = mlp((latent + actions + features, *heads, 1)) if shape.ball_rolls else None
         # An untrained correction is the identity: the raw simulator.
         for network in (self.correction, *([self.hits] if self.hits else [])):
@@ -182,10 +184,8 @@ class GroundingModel(nn.Module):
             parts["reward"] = 0.5 * _masked_mean((normal - true).square().sum(-1), windows.goes_on * mask)
             total = total + weights.reward * parts["reward"]
         corrected = self.correct(latent, action, windows.simulated_next)
-        error = ((corrected - windows.next_state) / self.correction_std).square()
-        if self.hits is not None:  # hits are too few to be learned beside the rest: see `fit_hits`
-            error = error[..., :-2]
-        parts["state"] = _masked_mean(error.mean(-1), mask)
+        error = ((corrected - windows.next_state) / self.correction_std)[..., : self.corrected_size].square().mean(-1)
+        parts["state"] = _masked_mean(error, mask)
         total = total + weights.state * parts["state"]
         return total, parts
 
@@ -217,7 +217,7 @@ def telemetry(model: GroundingModel, episodes: PairedEpisodes, weights: LossWeig
     if not samples.isfinite().all():
         raise BadInputError("the fit diverged: lower learning_rate in [ground], or look at the data's values")
     corrected = model.correct(latent, windows.action, windows.simulated_next)
-    figures: dict[str, float | None] = {"r2_state": correction_r2(corrected, windows, model.correction_std)}
+    figures: dict[str, float | None] = {"r2_state": correction_r2(corrected, windows, model)}
     if weights.reward > 0:
         known = windows.goes_on.bool() & mask
         predicted, true = model.rewards(latent, windows.action)[known], recorded_rewards(windows)[known]
@@ -236,11 +236,11 @@ def telemetry(model: GroundingModel, episodes: PairedEpisodes, weights: LossWeig
     return figures
 
 
-def correction_r2(corrected: Tensor, windows: PairedWindows, std: Tensor) -> float | None:
-    """Return the share of squared error in units of `std` (X,) that `corrected` (B, T, X) removes, if there is any."""
-    mask = windows.mask.bool()
-    landed = (corrected, windows.simulated_next)
-    wrong, raw = (((one - windows.next_state) / std)[mask].square().sum() for one in landed)
+def correction_r2(corrected: Tensor, windows: PairedWindows, model: GroundingModel) -> float | None:
+    """Return the share of squared error in units of the data that `corrected` (B, T, X) removes, if there is any."""
+    mask, size = windows.mask.bool(), model.corrected_size
+    errors = ((one - windows.next_state) / model.correction_std for one in (corrected, windows.simulated_next))
+    wrong, raw = (error[mask][:, :size].square().sum() for error in errors)
     return _explained(wrong, raw)
 
 

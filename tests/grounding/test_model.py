@@ -353,7 +353,7 @@ def test_shares_of_variance_are_those_of_real_steps() -> None:
     both = real[:, 1:]
     assert figures["r2_latent"] == pytest.approx(r2(mean[both], latent[:, 1:][both]), rel=1e-4)
     corrected = used.correct(latent, windows.action, windows.simulated_next)
-    assert figures["r2_state"] == correction_r2(corrected, windows, used.correction_std)
+    assert figures["r2_state"] == correction_r2(corrected, windows, used)
     two = GroundingModel(GroundingShape(4, 2, 2, latent_size=6, head_sizes=(8,))).requires_grad_(False)
     whole = two.rewards(two.encode(windows)[0], windows.action)[paid][:, 0]  # not the residual
     residual = replace(given, windows=replace(windows, own_reward=torch.randn(4, 12)))

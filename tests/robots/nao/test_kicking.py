@@ -135,9 +135,7 @@ def test_a_ball_that_rolls_keeps_to_its_way_as_fast_as_corrected(friction: float
 
 @pytest.mark.parametrize("before_m_s", [0.0, 0.1])
 @pytest.mark.parametrize("friction", [1.0, 2.0])
-def test_whether_a_correction_sets_a_ball_rolling_is_drawn_with_the_expected_speed(
-    before_m_s: float, friction: float
-) -> None:
+def test_a_correction_says_how_likely_a_ball_that_lies_is_hit(before_m_s: float, friction: float) -> None:
     count = 20_000
     simulator = VariedPlanar(one(count), BallVariation(ball_friction=(friction, friction)))
     start = START.clone()
@@ -148,8 +146,9 @@ def test_whether_a_correction_sets_a_ball_rolling_is_drawn_with_the_expected_spe
     torch.manual_seed(0)
     way, velocity = (simulator.settle(start.expand(count, 8), landed)[:, 4:] - START[:, 4:]).split(2, dim=-1)
     speed = velocity.norm(dim=-1)
-    assert speed.mean().item() == pytest.approx(0.1, abs=0.003)
     hit = speed > 0
+    # Balls that are hit are first measured at 0.2 m/s, so 0.1 m/s are half a hit.
+    assert hit.float().mean().item() == pytest.approx(0.5, abs=0.01)
     # It leaves at 0.5 m/s, and is slowed by 0.3 m/s² in the 0.2 s that it rolls.
     slowed = 0.3 * friction
     torch.testing.assert_close(speed[hit], torch.full_like(speed[hit], 0.5 - slowed * 0.2))
@@ -169,14 +168,14 @@ def kicked(simulator: kicking.BallAgent, speed_m_s: float) -> torch.Tensor:
 
 
 def test_kicking_on_from_too_far_does_not_help() -> None:
-    """A ball that is hit ends at 0.44 m/s: 0.055 says an eighth of a hit, and a half if said for long."""
+    """0.01 m/s say a twentieth of a hit, and a half if said for long."""
     torch.manual_seed(0)
     simulator = one(4000)
     needed = simulator.memory[:, 0].clone()
-    rolled = kicked(simulator, 0.055)
-    assert torch.equal(rolled, needed < 0.125)
-    for _ in range(60):
-        rolled |= kicked(simulator, 0.055)
+    rolled = kicked(simulator, 0.01)
+    assert torch.equal(rolled, needed < 0.05)
+    for _ in range(200):
+        rolled |= kicked(simulator, 0.01)
     assert torch.equal(rolled, needed < 0.5 - 1e-6)
 
 
@@ -184,7 +183,7 @@ def test_a_new_lie_and_a_new_episode_are_drawn_for_anew() -> None:
     torch.manual_seed(0)
     simulator = one(1000)
     needed = simulator.memory[:, 0].clone()
-    rolled = kicked(simulator, 0.22)
+    rolled = kicked(simulator, 0.1)
     after = simulator.memory
     assert torch.equal(after[~rolled, 0], needed[~rolled])
     torch.testing.assert_close(after[~rolled, 1], torch.full_like(needed[~rolled], 0.5))
