@@ -218,6 +218,7 @@ def _changes(before: Mapping[str, Any], now: Mapping[str, Any], recipe: Recipe) 
             texts += [f"{file} changed" for file, _, _ in changed_values(old or {}, new or {})]
             continue
         if isinstance(old, dict) and isinstance(config := getattr(recipe, name, None), Config):
+            old = {key: value for key, value in old.items() if key in type(config).model_fields}  # a key may be no more
             with suppress(RecipeError):
                 old = validated(old, type(config), name).model_dump(mode="json")
         if old != new:

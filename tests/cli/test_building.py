@@ -49,7 +49,6 @@ def test_an_option_of_0_is_given(home: Path) -> None:
         (["collect", "recipe.toml", "--resume"], r"leave out --resume"),
         (["collect", "antmaze-umaze", "--seed", "1", "--seed", "2"], r"give at most one --seed"),
         (["collect", "antmaze-umaze", "--behavior", "wild"], r"behavior: expected 'random', .*got 'wild'"),
-        (["collect", "antmaze-umaze", "--random-share", "0.5"], r"random_share: expected the behavior of a pol"),
         (["collect", "antmaze-umaze", "--max-steps", "-1"], r"max_steps: expected greater than"),
         (["collect", "humanoid-walker2d", "--clearance-m", "0.5", "--start", "task"], r"expected a task in a maze"),
         (["collect", "antmaze-umase"], r"did you mean 'antmaze-umaze'"),

@@ -340,7 +340,9 @@ def test_other_settings_are_refused_where_something_was_made_with_the_old_ones(
     assert states(recipe) == {}
 
 
-def test_changes_are_told_key_by_key_and_new_keys_have_their_defaults(recipe: Path, folder: Path) -> None:
+def test_changes_are_told_key_by_key_new_keys_have_their_defaults_and_old_ones_do_not_count(
+    recipe: Path, folder: Path
+) -> None:
     recipe.write_text(HEAD + "[train]\ntries = 7\nnum_envs = 3\n")
     with pytest.raises(RecipeError) as caught:
         run(recipe, root=recipe.parent)
@@ -354,6 +356,7 @@ def test_changes_are_told_key_by_key_and_new_keys_have_their_defaults(recipe: Pa
     record = folder / f"made_with/{TRAIN}.json"
     kept = json.loads(record.read_text())
     del kept["train"]["tries"]
+    kept["train"]["gone"] = 1
     record.write_text(json.dumps(kept))
     assert states(recipe) == {}
     record.write_text("[]")

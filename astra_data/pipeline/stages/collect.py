@@ -12,7 +12,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from astra_data.core.arrays import Floats, Ints, as_column
 from astra_data.core.checkpoint import Logbook
-from astra_data.core.config import Config, Count, NotNegative, Share, in_order
+from astra_data.core.config import Config, Count, NotNegative, in_order
 from astra_data.core.durable import file_digest
 from astra_data.core.errors import BadInputError
 from astra_data.core.lazy import Tensor, torch
@@ -23,7 +23,6 @@ from astra_data.dataset.columns import OUTCOME_COLUMNS, Array, Episode
 from astra_data.dataset.inspection import outcome_of
 from astra_data.dataset.versions import home_of
 from astra_data.dataset.writer import StagedWriter
-from astra_data.grounding.files import GROUNDING, TARGET_ENCODER, grounding_at, load_target_encoder
 from astra_data.policies.episodes import ObservedTargetEnv
 from astra_data.policies.ppo import Ppo, PpoConfig
 from astra_data.policies.running_policy import POLICY, Observed, PolicyFile, RunningPolicy, running
@@ -142,27 +141,7 @@ class PolicyBehavior:
         return self._running.act(state, goal)
 
 
-class MixedBehavior:
-    """A policy on a part of the robots, random commands on the others."""
-
-    def __init__(self, policy: "Behavior", random: RandomCommands, share: float) -> None:
-        """Let `random` act on a `share` of all episodes, spread evenly: the first n have it as well."""
-        self._policy, self._random, self._share = policy, random, share
-
-    def start(self, rows: range, seed: int) -> None:
-        """Begin the episodes `rows`."""
-        self._policy.start(rows, seed)
-        self._random.start(rows, seed)
-        episodes = torch.arange(rows.start, rows.stop + 1, dtype=torch.float64)
-        before = torch.floor(episodes * self._share + 1e-9)
-        self.is_random = (before.diff() > 0).unsqueeze(1)
-
-    def act(self, state: Tensor, goal: Tensor) -> Tensor:
-        """Return actions (B, A) for target states (B, S) and goals (B, G)."""
-        return torch.where(self.is_random, self._random.act(state, goal), self._policy.act(state, goal))
-
-
-Behavior = RandomCommands | PolicyBehavior | MixedBehavior
+Behavior = RandomCommands | PolicyBehavior
 
 
 def record(
@@ -297,10 +276,10 @@ def _lasts(running: RunningPolicy, seed: int, num_threads: int | None) -> float:
 class CollectConfig(Config):
     """What to collect; the paper uses 200 episodes of random behavior of up to 500 steps."""
 
-    behavior: Literal["random", "stress", "policy", "suboptimal_ppo", "suboptimal_sac"] = "random"
+    behavior: Literal["random", "stress", "suboptimal_ppo", "suboptimal_sac"] = "random"
     """"random": commands drawn from U[-1, 1] per axis, each held for a while. "stress": commands at the
-    bounds that often reverse, to provoke failures. "policy": a saved policy. "suboptimal_ppo",
-    "suboptimal_sac": a policy trained in the target and stopped early. Policies sample their actions."""
+    bounds that often reverse, to provoke failures. "suboptimal_ppo", "suboptimal_sac": a policy trained in
+    the target and stopped early, which samples its actions."""
     episodes: Count = 200
     """Number of episodes: with `least_steps` the maximum."""
     least_steps: Count | None = Field(default=None, exclude_if=lambda steps: steps is None)
@@ -318,25 +297,9 @@ class CollectConfig(Config):
     steering the robot would; 0: never."""
     ppo_steps: Count = 300_000
     """Environment steps after which the PPO training of the suboptimal policy stops."""
-    random_share: Share = Field(default=0.0, exclude_if=lambda share: not share)
-    """Fraction of a policy's episodes that get random commands instead, spread evenly over the dataset."""
-    policy: str | None = None
-    """Folder of the saved policy, as written by the stage `train`."""
-    grounding: str | None = None
-    """Folder of the grounding that computes the latent for the saved policy, if it has one."""
-    target_encoder: str | None = None
-    """Folder of the aligned target encoder; by default the grounding's own encoder is used."""
 
     @model_validator(mode="after")
-    def _fits_the_behavior(self) -> Self:
-        if self.behavior == "policy" and self.policy is None:
-            raise ValueError('behavior "policy": expected the folder of a trained policy as policy, got none')
-        artifacts = ("policy", "grounding", "target_encoder")
-        given = [name for name in artifacts if getattr(self, name) is not None]
-        if self.behavior != "policy" and given:
-            raise ValueError(f'{", ".join(given)}: expected behavior "policy", got "{self.behavior}"')
-        if self.random_share and self.behavior in {"random", "stress"}:
-            raise ValueError(f'random_share: expected the behavior of a policy, got "{self.behavior}"')
+    def _fits_a_disk(self) -> Self:
         if self.episodes * self.max_steps > MOST_STEPS:
             raise ValueError(
                 f"episodes: {self.episodes} of up to {self.max_steps} steps take terabytes: expected at most "
@@ -362,7 +325,7 @@ def collect(
     and seed. `resume` keeps the finished episodes of an interrupted call and records the rest.
 
     Raises:
-        BadInputError: the task is unknown, `out` exists, or an artifact of the behavior is missing.
+        BadInputError: the task is unknown, or `out` exists.
 
     Example:
         >>> from pathlib import Path
@@ -385,8 +348,6 @@ def collect(
         share = _TRAINING_SHARE if config.behavior.startswith("suboptimal") else 0.0
         training = part(progress, 0.0, share)
         behavior, metadata = _behavior(world, config, seed, writer, num_threads, training)
-        if config.random_share:
-            behavior = MixedBehavior(behavior, _random(world, config, RandomCommands), config.random_share)
         stopwatch, trained = Stopwatch(metadata.get("spent")), time.perf_counter()
         steps = _record(world, config, behavior, seed, writer, num_threads, part(progress, share, 1.0))
         if config.least_steps:
@@ -401,14 +362,11 @@ def collect(
 
 
 def _description(world: Task, config: CollectConfig, seed: int, name: str | None) -> dict[str, Any]:
-    files = _saved_files(config).items()
-    saved = {f"{kind}_sha256": file_digest(path) for kind, path in files if path.is_file()}
-    behaviors = config.behavior + ("-and-random" if config.random_share else "")
     return {
-        "name": f"{world.name}-{behaviors}-seed{seed}".replace("_", "-") if name is None else name,
+        "name": f"{world.name}-{config.behavior}-seed{seed}".replace("_", "-") if name is None else name,
         "version": "1.0.0",
         "stage": "collect",
-        "config": config.model_dump(mode="json") | saved,
+        "config": config.model_dump(mode="json"),
         "seeds": {"collect": seed, "subset": derive(seed, "subset")},
         "environment": {"id": world.name, "timestep_s": world.timestep_s, **world.facts},
     }
@@ -461,28 +419,13 @@ def _behavior(
 ) -> tuple[Behavior, dict[str, Any]]:
     """Return the behavior and its metadata; a policy trained for it is stored in the dataset."""
     if commands := {"random": RandomCommands, "stress": StressCommands}.get(config.behavior):
-        return _random(task, config, commands), {}
-    if config.behavior.startswith("suboptimal"):
-        by = partial(suboptimal_by_sac, steps=_SAC_STEPS, episode_steps=_SAC_EPISODE_STEPS)
-        if config.behavior == "suboptimal_ppo":
-            by = partial(suboptimal_by_ppo, steps=config.ppo_steps)
-        policy, metadata = by(task, seed=seed, folder=writer.folder, num_threads=num_threads, progress=progress)
-        writer.policy = writer.folder / POLICY
-        policy.save(writer.policy)
-        metadata["policy_sha256"] = file_digest(writer.policy)
-        return PolicyBehavior(running(task, policy)), metadata
-    files = _saved_files(config)
-    trained = PolicyFile.load(files["policy"])
-    encoder = load_target_encoder(files["target_encoder"]) if "target_encoder" in files else None
-    acts = running(task, trained, grounding_at(files.get("grounding")), encoder)
-    return PolicyBehavior(acts), {"policy_dataset": trained.dataset}
-
-
-def _random(task: Task, config: CollectConfig, commands: type[RandomCommands]) -> RandomCommands:
-    watch = WallWatch(task, config.clearance_m) if config.clearance_m else None
-    return commands(task.objective.action_size, held_steps(config.hold_s, task.timestep_s), watch)
-
-
-def _saved_files(config: CollectConfig) -> dict[str, Path]:
-    names = {"policy": POLICY, "grounding": GROUNDING, "target_encoder": TARGET_ENCODER}
-    return {kind: Path(folder) / name for kind, name in names.items() if (folder := getattr(config, kind))}
+        watch = WallWatch(task, config.clearance_m) if config.clearance_m else None
+        return commands(task.objective.action_size, held_steps(config.hold_s, task.timestep_s), watch), {}
+    by = partial(suboptimal_by_sac, steps=_SAC_STEPS, episode_steps=_SAC_EPISODE_STEPS)
+    if config.behavior == "suboptimal_ppo":
+        by = partial(suboptimal_by_ppo, steps=config.ppo_steps)
+    policy, metadata = by(task, seed=seed, folder=writer.folder, num_threads=num_threads, progress=progress)
+    writer.policy = writer.folder / POLICY
+    policy.save(writer.policy)
+    metadata["policy_sha256"] = file_digest(writer.policy)
+    return PolicyBehavior(running(task, policy)), metadata

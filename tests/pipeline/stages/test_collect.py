@@ -1,5 +1,3 @@
-import hashlib
-import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +17,8 @@ from astra_data.dataset.reader import Dataset
 from astra_data.dataset.writer import StagedWriter
 from astra_data.pipeline.stages import collect as stage
 from astra_data.pipeline.stages import collect as suboptimal
-from astra_data.pipeline.stages.collect import CollectConfig, WallWatch, collect, record
+from astra_data.pipeline.stages.collect import CollectConfig, PolicyBehavior, WallWatch, collect, record
+from astra_data.policies.running_policy import PolicyFile, running
 from astra_data.robots.registry import TASKS
 
 TINY = CollectConfig(episodes=3, max_steps=15)
@@ -136,27 +135,6 @@ def batches_of_two(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stage, "_NUM_ENVS", 2)
 
 
-@pytest.mark.usefixtures("small_training")
-def test_a_part_of_a_policys_episodes_may_have_random_commands(task: str, tmp_path: Path) -> None:
-    datasets = {}
-    kinds = (("policy", "suboptimal_ppo", 0.0), ("random", "random", 0.0), ("mixed", "suboptimal_ppo", 0.5))
-    for name, behavior, share in kinds:
-        config = TINY.model_copy(
-            update={"behavior": behavior, "random_share": share, "ppo_steps": 1, "max_steps": 3, "episodes": 4}
-        )
-        collect(task, config, seed=0, out=tmp_path / name, progress=silent)
-        datasets[name] = Dataset.open(tmp_path / name)
-    assert datasets["mixed"].reference == f"{TASK}-suboptimal-ppo-and-random-seed0@data-1.0.0"
-    first = {
-        name: [episode.columns[ACTION][0] for episode in dataset.episodes([ACTION])]
-        for name, dataset in datasets.items()
-    }
-    for index, command in enumerate(first["mixed"]):
-        same, other = ("random", "policy") if index % 2 else ("policy", "random")
-        np.testing.assert_array_equal(command, first[same][index])
-        assert (command != first[other][index]).all()
-
-
 @pytest.mark.usefixtures("batches_of_two")
 def test_only_as_many_episodes_are_kept_as_have_the_steps(
     task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -237,20 +215,21 @@ def test_after_interruptions_the_policy_is_not_trained_again(
 
 
 @pytest.mark.usefixtures("small_training")
-def test_the_policy_that_acted_acts_again(lasting: str, tmp_path: Path) -> None:
-    short = {"start": "task", "episodes": 3, "max_steps": 3}
-    config = CollectConfig(behavior="suboptimal_sac", **short)  # type: ignore[arg-type]
+def test_the_policy_that_acted_is_kept(lasting: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = CollectConfig(behavior="suboptimal_sac", start="task", episodes=3, max_steps=3)
     first = Dataset.open(collect(lasting, config, seed=0, out=tmp_path / "first", progress=silent))
-    again = CollectConfig(behavior="policy", policy=str(first.root / "meta/astra"), **short)  # type: ignore[arg-type]
-    second = Dataset.open(collect(lasting, again, seed=0, out=tmp_path / "second", progress=silent))
+    kept = PolicyFile.load(first.root / "meta/astra/policy.safetensors")
+    monkeypatch.setattr(stage, "suboptimal_by_sac", lambda *_, **__: (kept, {}))
+    second = Dataset.open(collect(lasting, config, seed=0, out=tmp_path / "second", progress=silent))
     assert second.content_hash == first.content_hash
     report = check(first.root)
     assert not report.notes and not report.faults
-    (first.root / "meta/astra/policy.safetensors").write_bytes(b"another")
-    assert re.search(r"policy\.safetensors is [0-9a-f]{64}, expected the sha256", check(first.root).faults[0])
-    (first.root / "meta/astra/policy.safetensors").unlink()
-    assert "policy.safetensors is not there, expected the sha256" in check(first.root).faults[0]
-    assert not (second.root / "meta/astra/policy.safetensors").exists()
+    behavior, state = PolicyBehavior(running(TASKS[lasting], kept)), first.columns([STATE])[STATE][:1]
+    drawn = []
+    for seed in (0, 1):  # the mean would be the same
+        behavior.start(range(1), seed)
+        drawn.append(behavior.act(torch.from_numpy(state), torch.zeros(1, 0)).tolist())
+    assert drawn[0] != drawn[1]
 
 
 @pytest.fixture
@@ -260,39 +239,6 @@ def lasting() -> Iterator[str]:
     TASKS[name] = replace(usual, name=name, objective=replace(usual.objective, horizon=70))
     yield name
     del TASKS[name]
-
-
-def test_a_saved_policy_acts(task: str, trained: Path, grounded: Path, aligned: Path, tmp_path: Path) -> None:
-    latent = {"policy": str(trained), "grounding": str(grounded), "target_encoder": str(aligned)}
-    config = TINY.model_copy(update={"behavior": "policy", "max_steps": 4, **latent})
-    collect(task, config, seed=0, out=tmp_path / "out", progress=silent, name="walks")
-    dataset = Dataset.open(tmp_path / "out")
-    assert dataset.reference == "walks@data-1.0.0"
-    told = dataset.description["config"]
-    for kind, folder in (("policy", trained), ("grounding", grounded), ("target_encoder", aligned)):
-        digest = hashlib.sha256((folder / f"{kind}.safetensors").read_bytes()).hexdigest()
-        assert told[f"{kind}_sha256"] == digest
-    told = dataset.description["behavior"]
-    assert told["policy_dataset"] == f"{TASK}-random-seed0@data-2.0.0"
-    actions = dataset.columns([ACTION])[ACTION]
-    by_source = TINY.model_copy(update=config.model_dump() | {"target_encoder": None})
-    collect(task, by_source, seed=0, out=tmp_path / "source", progress=silent)
-    assert (Dataset.open(tmp_path / "source").columns([ACTION])[ACTION][0] != actions[0]).any()
-    # Drawn, not the mean: alike starts would give alike commands.
-    assert np.abs(np.diff(actions, axis=0)).min() > 0 and np.abs(actions).max() <= 1.0
-
-
-def test_a_policy_that_is_missing_or_does_not_fit_is_told(task: str, trained: Path, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r'behavior "policy": expected the folder'):
-        CollectConfig(behavior="policy")
-    with pytest.raises(ValueError, match=r'policy: expected behavior "policy", got "random"'):
-        CollectConfig(policy=str(trained))
-    with pytest.raises(ValueError, match=r'random_share: expected the behavior of a policy, got "stress"'):
-        CollectConfig(behavior="stress", random_share=0.5)
-    without_latent = TINY.model_copy(update={"behavior": "policy", "policy": str(trained)})
-    with pytest.raises(BadInputError, match=r"takes 24 values, .* gives 8: expected a policy of"):
-        collect(task, without_latent, seed=0, out=tmp_path / "out", progress=silent)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_commands_that_lead_to_walls_are_replaced_where_it_is_asked_for(task: str, tmp_path: Path) -> None:
