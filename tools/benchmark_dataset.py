@@ -67,8 +67,7 @@ def measurements(root: Path, data: list[Episode], lerobot: Any) -> Iterator[tupl
     yield (
         "frames written",
         {
-            "ours": lambda: write(ours, data, "snappy"),
-            "ours, zstd": lambda: write(root / "zstd", data, "zstd"),
+            "ours": lambda: write(ours, data),
             f"LeRobot, {frames_of(few)} frames": lambda: theirs.write(few),
             "Minari, HDF5": lambda: minari_set.write(data),
             "robomimic's HDF5": lambda: hdf5.write(data),
@@ -127,11 +126,11 @@ def random_walks(episodes: int, steps: int) -> list[Episode]:
     ]
 
 
-def write(root: Path, data: list[Episode], compression: str) -> int:
+def write(root: Path, data: list[Episode]) -> int:
     """Write our dataset, with its statistics, hash and validation."""
     shutil.rmtree(root, ignore_errors=True)
-    settings: dict[str, Any] = {"description": {"name": "walks", "stage": "import"}, "compression": compression}
-    with DatasetWriter(root, COLUMNS, fps=FPS, task="walk", **settings) as writer:
+    description = {"name": "walks", "stage": "import"}
+    with DatasetWriter(root, COLUMNS, fps=FPS, task="walk", description=description) as writer:
         for episode in data:
             writer.add(episode)
     return frames_of(data)

@@ -4,7 +4,7 @@ import ast
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import cache, wraps
+from functools import wraps
 from importlib.util import find_spec
 from inspect import Parameter, Signature, signature
 from pathlib import Path
@@ -142,24 +142,14 @@ def with_settings(place: str) -> Callable[[Callable[..., None]], Callable[..., N
     return decorated
 
 
-@cache
 def fields_of(place: str) -> list[tuple[Any, str]]:
-    """Return the fields of a model at "package.module:Model", its bases' too, each with the text below it."""
+    """Return the fields of a model at "package.module:Model", each with the text below it."""
     module, _, name = place.partition(":")
     spec = find_spec(module)
     assert spec is not None and spec.origin is not None
     tree = ast.parse(Path(spec.origin).read_text(encoding="utf-8"))
     (model,) = (node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == name)
-    imported = {
-        alias.name: f"{node.module}:{alias.name}"
-        for node in tree.body
-        if isinstance(node, ast.ImportFrom)
-        for alias in node.names
-    }
     found: list[tuple[Any, str]] = []
-    for base in model.bases:
-        if isinstance(base, ast.Name) and base.id not in ("Config", "BaseModel"):
-            found += fields_of(imported.get(base.id, f"{module}:{base.id}"))
     for node, after in zip(model.body, [*model.body[1:], None], strict=True):
         if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
             text = after.value.value if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant) else ""

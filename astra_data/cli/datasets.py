@@ -294,7 +294,7 @@ def validate(
     from astra_data.dataset.columns import TERMINATED
     from astra_data.dataset.doctor.check import check, compare_with_lerobot
     from astra_data.dataset.inspection import endings_of
-    from astra_data.dataset.reader import Dataset, can_be_repaired
+    from astra_data.dataset.reader import Dataset
     from astra_data.dataset.versions import locate
 
     root = locate(dataset)
@@ -306,9 +306,8 @@ def validate(
     if report.faults:
         count = "1 error" if report.fault_count == 1 else f"{report.fault_count} errors"
         message = "\n  ".join([f"{root} has {count}:", *report.faults])
-        if can_be_repaired(root):
-            message += f"\nTo recover its intact episodes: astra-data repair {root} --out DIR"
-        raise CorruptDatasetError(message)
+        advice = f"To recover its intact episodes: astra-data repair {root} --out DIR"
+        raise CorruptDatasetError(f"{message}\n{advice}")
     typer.echo(f"{printable(str(root))} is intact: {report.episodes} episodes, {report.frames} steps")
     try:
         whole = Dataset.open(root)

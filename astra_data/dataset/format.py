@@ -31,8 +31,6 @@ DIGESTS_PATH = f"{OUR_FOLDER}/digests.parquet"
 POLICY_PATH = f"{OUR_FOLDER}/policy.safetensors"
 METADATA_KEYS = ("episode_uid", "length")  # first columns of `METADATA_PATH`; the others are the episodes' own metadata
 
-COMPRESSIONS = ("snappy", "zstd")  # of data files: snappy, as LeRobot writes, is faster, zstd smaller
-
 QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
 STATISTICS = ("min", "max", "mean", "std", "q01", "q10", "q50", "q90", "q99")
 STORED_STATISTICS = ("min", "max", "mean", "std", "count", "q01", "q10", "q50", "q90", "q99")  # in LeRobot's order

@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 from astra_data.core.arrays import Bools, Ints
 from astra_data.core.errors import CorruptDatasetError, in_short
 from astra_data.dataset.columns import Array, Column
-from astra_data.dataset.format import CHUNK_SIZE, COMPRESSIONS, DATA_FILE_SIZE_MB
+from astra_data.dataset.format import CHUNK_SIZE, DATA_FILE_SIZE_MB
 
 FILE_SIZE_LIMIT = DATA_FILE_SIZE_MB * 2**20
 UNREADABLE = (OSError, ValueError, pa.ArrowException)  # of damaged files; ValueError: names are not valid UTF-8
@@ -117,7 +117,7 @@ class RotatingWriter:
         pattern: str,
         schema: pa.Schema,
         encodings: Mapping[str, str] | None = None,
-        compression: str = COMPRESSIONS[0],
+        compression: str = "snappy",  # as LeRobot's; zstd is smaller, and slower
     ) -> None:
         """Start the first file; `pattern` names the files, `encodings` those of their columns."""
         self.chunk_index = self.file_index = 0

@@ -22,7 +22,7 @@ from astra_data.dataset import format as layout
 from astra_data.dataset import plain
 from astra_data.dataset.cameras import Camera, clip_fault, decoded, read_cameras
 from astra_data.dataset.columns import RESERVED, SUCCESS, Array, Column, Episode, Scalar
-from astra_data.dataset.lerobot_recording import RecordedFiles, declared_columns, open_recording, stored_features
+from astra_data.dataset.lerobot_recording import RecordedFiles, open_recording
 from astra_data.dataset.parquet import read_arrays, read_blocks, rows_of, to_numpy
 from astra_data.dataset.statistics import ranges
 
@@ -449,19 +449,8 @@ def explained(root: Path) -> Iterator[None]:
         yield
     except (CorruptDatasetError, KeyError) as error:
         fault = f"{error} is missing in its metadata" if isinstance(error, KeyError) else error
-        others = " or run the stage that wrote it again"
-        if can_be_repaired(root):
-            repair = f"`astra-data repair {root} --out FOLDER`"
-            others = f", run the stage that wrote it again, or recover its intact episodes: {repair}"
-        advice = f"Restore it from a copy{others}."
+        advice = (
+            "Restore it from a copy, run the stage that wrote it again, or recover its intact episodes: "
+            f"`astra-data repair {root} --out FOLDER`."
+        )
         raise CorruptDatasetError(f"{root} is incomplete or was altered: {fault}. {advice}") from error
-
-
-def can_be_repaired(root: Path) -> bool:
-    """Return whether columns and rate of the dataset in `root` are known, without which no value is."""
-    info = plain.read_object(root / layout.INFO_PATH)
-    try:
-        known = {} if isinstance(info, str) else {**info, "features": stored_features(root, info.get("features"), [])}
-        return bool(declared_columns(root, known))
-    except CorruptDatasetError:
-        return False

@@ -11,7 +11,6 @@ import pyarrow as pa
 from astra_data.core.arrays import Floats, as_rows
 from astra_data.dataset.columns import Array, Column
 from astra_data.dataset.format import (
-    COMPRESSIONS,
     EPISODES_PATH,
     QUANTILES,
     STATISTICS,
@@ -105,7 +104,7 @@ class EpisodeRows:
         self.pictures: list[Mapping[str, Any]] = []
         kept = [f"stats/{column.name}/{name}.list.element" for column in columns for name in STATISTICS]
         encodings = dict.fromkeys(kept, "BYTE_STREAM_SPLIT")
-        self._writer = RotatingWriter(root, EPISODES_PATH, self._schema, encodings, COMPRESSIONS[1])
+        self._writer = RotatingWriter(root, EPISODES_PATH, self._schema, encodings, "zstd")
         self._rows: list[tuple[int, int, int]] = []
         self._statistics: list[Floats] = []
         self._episodes = self._frames = 0

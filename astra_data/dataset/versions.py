@@ -29,7 +29,7 @@ from astra_data.dataset.writer import DatasetWriter
 
 _LOG = logging.getLogger(__name__)
 
-Change = Literal["columns", "episodes", "description"]
+Change = Literal["columns", "episodes"]
 
 _REFERENCE = re.compile(rf"(?P<name>{NAME.pattern})(@(data-)?(?P<version>{VERSION.pattern}))?")
 
@@ -67,10 +67,7 @@ class Version:
         every = [self, *taken]
         if change == "columns":
             return Version(max(every).major + 1, 0, 0)
-        if change == "episodes":
-            return Version(self.major, max(one.minor for one in every if one.major == self.major) + 1, 0)
-        alike = [one.patch for one in every if (one.major, one.minor) == (self.major, self.minor)]
-        return Version(self.major, self.minor, max(alike) + 1)
+        return Version(self.major, max(one.minor for one in every if one.major == self.major) + 1, 0)
 
 
 def home() -> Path:

@@ -62,7 +62,6 @@ class DatasetWriter:
         task: str,
         description: Mapping[str, Any],
         subset_seed: int = 0,
-        compression: str = layout.COMPRESSIONS[0],
         cameras: Mapping[str, Mapping[str, Any]] | None = None,
     ) -> None:
         """Prepare to write; entering the block starts.
@@ -74,7 +73,6 @@ class DatasetWriter:
             task: of all episodes, a sentence or a name.
             description: see `complete_description`.
             subset_seed: of the permutation whose prefixes are the nested subsets.
-            compression: of the data files, one of `format.COMPRESSIONS`.
             cameras: LeRobot's features of the cameras of every episode.
         """
         given = [column.name for column in columns]
@@ -84,9 +82,6 @@ class DatasetWriter:
             **{f"column {name}: is filled in by the writer, leave it out": False for name in reserved},
             "no columns": bool(given),
             f"fps {fps!r}, expected a positive int": type(fps) is int and fps >= 1,
-            f"compression {compression!r}, expected {' or '.join(layout.COMPRESSIONS)}": (
-                compression in layout.COMPRESSIONS
-            ),
             f"task {task!r}, expected text of valid characters": isinstance(task, str) and is_text(task),
         }
         around = [folder for folder in root.absolute().parents if (folder / layout.INFO_PATH).is_file()]
@@ -102,7 +97,7 @@ class DatasetWriter:
         self._most_rows = 1 if images_of else parquet.GROUP_ROWS  # of several episodes
         self._group: list[dict[str, Any]] = []  # values or images of the episodes of the next row group
         self._group_rows = 0
-        self._fps, self._task, self._subset_seed, self._compression = fps, task, subset_seed, compression
+        self._fps, self._task, self._subset_seed = fps, task, subset_seed
         self._description = described.complete_description(description)
         self.made: dict[str, Any] = {}
         self.policy: Path | None = None
@@ -124,9 +119,7 @@ class DatasetWriter:
         with ExitStack() as stack:
             self._folder = stack.enter_context(durable.atomic_folder(self.root))
             encodings = layout.data_encodings(self._stored)
-            self._data = parquet.RotatingWriter(
-                self._folder, layout.DATA_PATH, self._schema, encodings, self._compression
-            )
+            self._data = parquet.RotatingWriter(self._folder, layout.DATA_PATH, self._schema, encodings)
             stack.callback(self._data.abandon)
             self._rows = EpisodeRows(self._folder, self._stored, self._task, self._cameras)
             self._clips = {

@@ -93,7 +93,7 @@ class Cutter:
         """Add `block`, which begins a new file if it `is_apart`; yield the columns and metadata of ended episodes."""
         if is_apart or block.starts:
             yield from self.cut()
-            self._begins = "file" if is_apart else "back" if block.is_back else "source"
+            self._begins = "file" if is_apart else "source"
         columns, bad = self.convert(block)
         n, mapping = len(block), self._mapping
         rejected = np.logical_or.reduce([np.zeros(n, bool), *bad.values()])

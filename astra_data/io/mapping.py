@@ -10,7 +10,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from astra_data.core.config import Config, Count, Positive, load_tables, validated
 from astra_data.core.errors import RecipeError
-from astra_data.dataset.columns import DONE, RESERVED, REWARD, ROLES, STATE, SUCCESS, TERMINATED, TRUNCATED
+from astra_data.dataset.columns import DONE, RESERVED, REWARD, STATE, SUCCESS, TERMINATED, TRUNCATED
 from astra_data.dataset.lerobot_recording import FLOATS
 
 Index = Annotated[int, Field(ge=0)]
@@ -64,8 +64,6 @@ class ColumnMapping(Config):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        if unknown := sorted(set(self.role) - set(ROLES)):
-            raise ValueError(f"unknown role {', '.join(unknown)}, expected {', '.join(ROLES)}")
         if doubled := sorted({name for name in self.names if self.names.count(name) > 1}):
             raise ValueError(f"names has {', '.join(doubled)} more than once")
         if self.latched and self.gap_s is not None:
@@ -158,8 +156,6 @@ class ImportMapping(Config):
             slip = get_close_matches(name, {*MAPPED_FLAGS, *FLOATS} - self.columns.keys(), n=1, cutoff=0.9)
             if slip and name not in (*MAPPED_FLAGS, *FLOATS):
                 faults.append(f"column {name}: did you mean '{slip[0]}'?")
-            if not name or "/" in name:
-                faults.append(f"column '{name}': expected a name without '/'")
         jump = self.split.jump
         if jump is not None and jump.column not in self.columns:
             faults.append(f"split.jump.column '{jump.column}', expected one of {', '.join(self.columns)}")

@@ -1,9 +1,10 @@
 """Recordings in other formats: their files, and the blocks of rows that importers read from them."""
 
+import os
 import re
 import shlex
 import tarfile
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePath, PurePosixPath
@@ -53,7 +54,7 @@ class Source:
     member: tarfile.TarInfo | None  # its entry in the archive
     recording: Path  # the file, folder or archive given by the user; its files follow one another
     most_bytes: int = SMALL_BYTES  # most bytes of values that are taken from it
-    name: str = ""  # what it is called, by default its path within its recording
+    name: str = ""  # what it is called, by default by the last part of its path
     parts: Mapping[str, "Source"] = field(default_factory=dict, compare=False)
     """The files of a recording that are joined by time, by their names in the mapping."""
     faults: list[str] | None = field(default=None, compare=False)
@@ -82,10 +83,13 @@ class Source:
                 raise
             self.faults.append(str(error))
 
+    @property
+    def place(self) -> Path:
+        """Its path, in which an archive is a folder."""
+        return self.path if self.member is None else self.path / self.member.name
+
     def __str__(self) -> str:
-        if self.name or self.member is None:
-            return self.name or named(self.path, self.recording)
-        return f"{self.path.name}/{self.member.name}"
+        return self.name or self.place.name
 
     @contextmanager
     def open(self) -> Iterator[IO[bytes]]:
@@ -109,7 +113,6 @@ class Block:
     starts: bool = False  # whether an episode of the format itself begins with the first row
     torn: int = 0  # how many rows after the last one are cut off at the end of the file, 0 or 1
     notes: tuple[str, ...] = ()  # what the import's report tells of them, in a line each
-    is_back: bool = False  # whether that episode begins since time goes back
     places: Mapping[int, str] = field(default_factory=dict)
     """Where the values of some rows were recorded, if the number of the row does not tell."""
     line: Callable[[int], int] | None = None  # of a row of the file by its number, where lines may be empty
@@ -208,11 +211,10 @@ def find_sources(
     if file_format == "csv" and mapping and mapping.files:
         sources = _joined(sources, mapping.files)
     for source in sources:
-        if not is_text(f"{source.path}/{source}"):
+        if not is_text(str(source.place)):
             raise BadInputError(f"{str(source)!r}: expected a name in UTF-8; rename the file to import it")
     most = max_bytes or max(SMALL_BYTES, MOST_UNPACKED * sum(file.stat().st_size for file in files_of(sources)))
-    paths = [source.path / (source.member.name if source.member else "") for source in sources]
-    names = _longer([str(source) for source in sources], paths)
+    names = named((source.place, source.recording) for source in sources)
     return [replace(source, name=name, most_bytes=most) for source, name in zip(sources, names, strict=True)]
 
 
@@ -229,15 +231,15 @@ def _found(recording: Path, suffixes: Sequence[str]) -> list[Source]:
         expected = f"files that end with {endings}" if endings else "files"
         hint = foreign([str(path) for path in files_below(recording)]) if recording.is_dir() else ""
         raise BadInputError(f"{recording}: {hint or f'expected {expected}, found none'}")
-    return sorted(sources, key=lambda source: natural(f"{source.path}/{source}"))
+    return sorted(sources, key=lambda source: natural(str(source.place)))
 
 
 def other_files(recordings: Sequence[Path], suffixes: Sequence[str]) -> tuple[str, ...]:
     """Name the files in folders and archives that `find_sources` leaves out by their endings, but texts for people."""
     beside = (*suffixes, ".toml", ".md")
     inside = [source for path in recordings if path.is_dir() or is_archive(path) for source in _inside(path)]
-    names = [name for name in map(str, inside) if not name.lower().endswith(beside)]
-    return tuple(sorted((n for n in names if not PurePosixPath(n).name.lower().startswith("readme")), key=natural))
+    others = [(one.place, one.recording) for one in inside if not str(one).lower().endswith(beside)]
+    return tuple(sorted(named(pair for pair in others if not pair[0].name.lower().startswith("readme")), key=natural))
 
 
 def refuse_dataset(place: Path) -> None:
@@ -312,10 +314,10 @@ def _joined(sources: Sequence[Source], names: Sequence[str]) -> list[Source]:
     """Group files of one folder that are parts of one recording: names that end with `names` and else are the same."""
     groups: dict[tuple[str, str], dict[str, Source]] = {}
     for source in sources:
-        path = PurePosixPath(source.path if source.member is None else f"{source.path}/{source.member.name}")
+        folder, file = str(source.place.parent), source.place.name
         for name in sorted(names, key=len, reverse=True):
-            if path.name.endswith(name):
-                groups.setdefault((str(path.parent), path.name.removesuffix(name)), {})[name] = source
+            if file.endswith(name):
+                groups.setdefault((folder, file.removesuffix(name)), {})[name] = source
                 break
     faults = [] if groups else [f"expected files whose names end with {', '.join(names)}, found none"]
     for (folder, prefix), found in groups.items():
@@ -335,27 +337,15 @@ def files_of(sources: Sequence[Source]) -> dict[Path, Path]:
     return files
 
 
-def named(path: Path, recording: Path) -> str:
-    """Name a file by its path within a recording that is a folder."""
-    within = path.relative_to(recording) if path.is_relative_to(recording) else Path()
-    return within.as_posix() if within.parts else path.name
+def named(files: Iterable[tuple[Path, Path]]) -> list[str]:
+    """Name files, each given with its recording, by their paths within the folder that holds all of these."""
+    files = list(files)
+    folders = {each if each.is_dir() and each != place else each.parent for place, each in files}
+    root = os.path.commonpath([folder.absolute() for folder in folders]) if folders else ""
+    return [place.absolute().relative_to(root).as_posix() for place, _ in files]
 
 
 def identities(sources: Sequence[Source]) -> list[dict[str, str]]:
     """Return name and sha256 of every file of the recordings."""
     files = files_of(sources)
-    names = _longer([named(file, recording) for file, recording in files.items()], list(files))
-    return [{"name": name, "sha256": file_digest(file)} for name, file in zip(names, files, strict=True)]
-
-
-def _longer(names: Sequence[str], paths: Sequence[Path]) -> list[str]:
-    """Return `names`, the ends of `paths`; those of several paths are longer ends, by which these differ."""
-    places = [path.absolute() for path in paths]
-    of_name: dict[str, set[Path]] = {}
-    for name, place in zip(names, places, strict=True):
-        of_name.setdefault(name, set()).add(place)
-    longer = [
-        "/".join(place.parts[-len(PurePosixPath(name).parts) - 1 :]) if len(of_name[name]) > 1 else name
-        for name, place in zip(names, places, strict=True)
-    ]
-    return longer if longer == list(names) else _longer(longer, paths)
+    return [{"name": name, "sha256": file_digest(file)} for name, file in zip(named(files.items()), files, strict=True)]

@@ -64,7 +64,6 @@ class Resampler:
         self._refuse_apart()
         self._periods = usual_periods(self._moments, round((mapping.split.gap_s or 0) * 1e9))
         self._held: dict[str, Any] = {}
-        self._is_back = False
         self._start: int | None = None
         self._row = self._rows = self._delay_ns = 0
         often = {topic: _messages_per_row(1e9 / mapping.fps / period) for topic, period in self._periods.items()}
@@ -79,16 +78,15 @@ class Resampler:
         self._commands = {t: n for n, c in columns if n.startswith(ACTION) for t in map(of.__getitem__, c.fields)}
         self._lossy = self._commands.keys() | {of[field] for field in mapping.flag_fields}
 
-    def rows(self, messages: Iterable[tuple[str, int, Any, bool]]) -> Iterator[tuple[bool, bool, dict[str, Any]]]:
-        """Yield whether a row begins an episode, whether it does since time goes back, and each topic's message."""
+    def rows(self, messages: Iterable[tuple[str, int, Any]]) -> Iterator[tuple[bool, dict[str, Any]]]:
+        """Yield whether a row begins an episode, and each topic's message."""
         time = 0
-        for topic, time, message, goes_back in messages:
+        for topic, time, message in messages:
             # A pause: all topics that are not latched are silent for too long.
             if self._start is not None and len(self._silent(time)) == len(self._expiring):
                 yield from self._sampled(self._end(max(self.times[topic] for topic in self._expiring)))
                 self._start = None
             yield from self._sampled(time)
-            self._is_back |= goes_back
             if self._start is not None:
                 self._messages[topic] += 1
                 self._skipped[topic] += topic in self._fresh
@@ -133,7 +131,7 @@ class Resampler:
                 )
         return tuple(f"{self._origin}: {note}" for note in notes)
 
-    def _sampled(self, time: int) -> Iterator[tuple[bool, bool, dict[str, Any]]]:
+    def _sampled(self, time: int) -> Iterator[tuple[bool, dict[str, Any]]]:
         """Yield the rows before `time` that have not been sampled yet."""
         self._refuse_gap(time)
         while self._start is not None:
@@ -148,8 +146,7 @@ class Resampler:
                 self._rows += 1
                 self._repeated.update(self.topics.keys() - self._fresh)
             self._fresh.clear()
-            yield self._row == 0, self._row == 0 and self._is_back, dict(self._held)
-            self._is_back &= self._row > 0
+            yield self._row == 0, dict(self._held)
             self._row += 1
 
     def _midway(self, time: int) -> int:

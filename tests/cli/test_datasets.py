@@ -215,25 +215,6 @@ def test_validate_and_repair(
     assert "exists already" in capsys.readouterr().err and called(monkeypatch, "validate", tmp_path / "saved") == 0
 
 
-@pytest.mark.parametrize(
-    ("content", "fault"),
-    [
-        ("{", "meta/info.json is no JSON object"),
-        ("{}", "fps is None"),
-        ('{"fps": 0.5, "features": {}}', "data_path is None"),
-    ],
-)
-def test_repair_is_not_advised_where_it_cannot_help(
-    content: str, fault: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    root = write_fake(tmp_path / "set").root
-    (root / "meta/info.json").write_text(content)
-    assert called(monkeypatch, "validate", root) == 1
-    told = capsys.readouterr().err
-    assert fault in told and "astra-data repair" not in told
-    assert called(monkeypatch, "repair", root, "--out", tmp_path / "saved") == 1
-
-
 def test_lineage_and_differences_are_shown(tmp_path: Path) -> None:
     first = write_fake(tmp_path / "first")
     made = delete(first, [13], out=tmp_path / "made")

@@ -30,7 +30,6 @@ def test_the_next_version_is_free() -> None:
     taken = versions("1.2.3", "1.4.0", "1.2.7", "3.9.0")
     version = Version.parse("1.2.3")
     assert str(version.next("columns", taken)) == "4.0.0" and str(version.next("episodes", taken)) == "1.5.0"
-    assert str(version.next("description", taken)) == "1.2.8"
 
 
 def test_a_dataset_is_found_by_folder_name_and_version(home: Path, tmp_path: Path) -> None:

@@ -143,14 +143,13 @@ def test_a_field_that_is_read_already_is_not_proposed() -> None:
         row_count("a", [*shapes, "q3"], shapes)
 
 
-def test_files_of_one_name_in_several_recordings_are_told_apart_by_their_paths(tmp_path: Path) -> None:
+def test_files_are_named_by_their_paths_in_the_folder_that_holds_all_recordings(tmp_path: Path) -> None:
     for name in ("a/run/log.csv", "b/run/log.csv", "b/log.csv", "c/other.csv"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(name)
     files = ["a/run/log.csv", "b/run/log.csv", "b/log.csv", "c/other.csv", "c/other.csv"]
     sources = listed(*(tmp_path / name for name in files))
-    expected = ["a/run/log.csv", "b/run/log.csv", "b/log.csv", "other.csv", "other.csv"]
-    assert [str(source) for source in sources] == expected
-    assert [one["name"] for one in identities(sources)] == expected[:4]
+    assert [str(source) for source in sources] == files
+    assert [one["name"] for one in identities(sources)] == files[:4]
     folders = listed(tmp_path / "a", tmp_path / "b")
-    assert [str(source) for source in folders] == ["a/run/log.csv", "log.csv", "b/run/log.csv"]
+    assert [str(source) for source in folders] == ["a/run/log.csv", "b/log.csv", "b/run/log.csv"]

@@ -152,25 +152,10 @@ def _row_groups(file: pq.ParquetFile, columns: Sequence[plain.PlainColumn]) -> I
         try:
             table = file.read_row_group(group, columns=[column.name for column in columns], use_threads=False)
             if not plain.schema_faults(table.schema, columns):
-                table = _filled(table, columns)
                 plain.block_values(table, columns)
             yield group, table
         except (*UNREADABLE, CorruptDatasetError) as error:
             yield group, in_short(error)
-
-
-def _filled(table: pa.Table, columns: Sequence[plain.PlainColumn]) -> pa.Table:
-    """Return `table` with NaN for floats that are missing, so that only their episodes are left out."""
-    for column in columns:
-        rows = table.column(column.name)
-        parts = [rows, *(chunk.flatten() for chunk in rows.chunks if column.size > 1)]
-        if np.dtype(column.dtype).kind == "f" and any(part.null_count for part in parts):
-            lists = [(row or [None] * column.size) if column.size > 1 else [row] for row in rows.to_pylist()]
-            known = [[np.nan if value is None else value for value in row] for row in lists]
-            made = known if column.size > 1 else [value for [value] in known]
-            at = table.schema.get_field_index(column.name)
-            table = table.set_column(at, column.name, pa.array(made, column.arrow_type))
-    return table
 
 
 class _Page(NamedTuple):

@@ -233,13 +233,12 @@ class Timeline:
             shift = self._times[before:start].max() + pause_ns - self._times[start:end].min()
             self._times[start:end] += shift
         self._order = np.argsort(self._times, kind="stable").tolist()
-        self._firsts = {self._order[start] for start in starts[1:]}
         kinds = np.array(topics)
         self.moments = {topic: np.sort(self._times[kinds == number]) for topic, number in numbers.items()}
         """Topic to the times of its messages in ns, as `messages` yields them, in their order."""
 
-    def messages(self) -> Iterator[tuple[str, int, int, Any, bool]]:
-        """Yield topic, time and log time in ns, content, and whether the clock was set back: by times that only rise.
+    def messages(self) -> Iterator[tuple[str, int, int, Any]]:
+        """Yield topic, time and log time in ns, and content, by times that only rise.
 
         Only those that are out of order are held in memory.
         """
@@ -251,8 +250,7 @@ class Timeline:
                 held[at] = each
             topic, message = held.pop(number)
             content = self._file.decoder(message.channel_id)(message.data)
-            time = int(self._times[number])
-            yield topic, time, message.log_time, content, number in self._firsts
+            yield topic, int(self._times[number]), message.log_time, content
 
 
 SUFFIXES = (".mcap",)
@@ -356,12 +354,10 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     known = sorted(file.topics - by_topic.keys())
     rows: dict[str, list[Message]] = {topic: [] for topic in fields}
     first = count = 0
-    is_back = False
-    for begins, goes_back, row in resampler.rows(_messages(source, timeline, fields)):
+    for begins, row in resampler.rows(_messages(source, timeline, fields)):
         if begins and count > first:
-            yield replace(_block(source, rows, fields), row=first, is_back=is_back, known=known)
+            yield replace(_block(source, rows, fields), row=first, known=known)
             rows, first = {topic: [] for topic in fields}, count
-        is_back = goes_back if begins else is_back
         for topic, message in row.items():
             rows[topic].append(message)
         count += 1
@@ -371,7 +367,7 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     for silence in resampler.endings():
         _log.warning("%s", silence)
     if count > first:
-        block = replace(_block(source, rows, fields), row=first, is_back=is_back, known=known)
+        block = replace(_block(source, rows, fields), row=first, known=known)
         yield replace(block, torn=file.is_cut, notes=resampler.unevenness())
 
 
@@ -408,9 +404,9 @@ def _streams(file: McapFile, fields: Sequence[MessageField], of: dict[str, str],
 
 def _messages(
     source: Source, timeline: Timeline, fields: Mapping[str, list[MessageField]]
-) -> Iterator[tuple[str, int, Message, bool]]:
+) -> Iterator[tuple[str, int, Message]]:
     sizes: dict[str, tuple[int, ...]] = {}
-    for topic, time, log_time, content, is_back in timeline.messages():
+    for topic, time, log_time, content in timeline.messages():
         values, faults = dict[str, Array](), list[str]()
         for each in fields[topic]:
             try:
@@ -421,7 +417,7 @@ def _messages(
         faults += [f"{', '.join(changed)} changes in size"] if changed else []
         if faults:
             raise BadInputError(f"{source} at {log_time} ns: {'; '.join(faults)}")
-        yield topic, time, (log_time, values), is_back
+        yield topic, time, (log_time, values)
 
 
 def _block(

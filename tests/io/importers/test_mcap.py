@@ -156,7 +156,7 @@ def test_where_a_clock_is_set_back_an_episode_begins_and_is_counted(tmp_path: Pa
     """Before, both stretches were one, with their rows in turn."""
     back = [(topic, time - 2, content) for topic, time, content in drive(3, 6)]
     dataset, report = imported(tmp_path, write_json(tmp_path / "log.mcap", drive(0, 3) + back), MAPPING)
-    assert report.tally.split_points == {"back": 1}
+    assert report.tally.split_points == {"source": 1}
     values = dataset.columns([STATE, ACTION])
     assert dataset.lengths.tolist() == [29, 29]
     assert values[ACTION].tolist() == values[STATE][:, 0].tolist() == [*range(29), *range(30, 59)]
