@@ -67,16 +67,6 @@ class Clumsy(Glider):
         super().__init__(1)
 
 
-class Lazy(Glider):
-    def step(self, action: Tensor) -> Tensor:
-        raise NotImplementedError
-
-
-class Stateless(Glider):
-    def __init__(self, num_envs: int) -> None:
-        pass
-
-
 class Narrow(Glider):
     def __init__(self, num_envs: int) -> None:
         self.state = torch.zeros(num_envs, 1)

@@ -10,7 +10,6 @@ from astra_data.robots.nao.walk import FOOT_HEIGHT_M, TO_MOTORS
 
 NO_ERRORS = PerceptionErrors(*(0.0,) * 3, 2.0, 0.0, (0.0, 0.0), *(0.0,) * 4, 0.5, 0.0, np.pi, 0.0)
 """Exact estimates."""
-TOTAL_MASS_KG = 5.36
 
 
 def foot_poses(angles: Floats) -> Floats:

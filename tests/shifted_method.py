@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from astra_data.grounding.fit import Fitting
-from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.simulator import EpisodeSimulator, FittedGrounding
 from astra_data.methods.method import Method
 from astra_data.worlds.protocols import PlacedSimulator
@@ -87,15 +86,3 @@ class Narrow(Shifted):
 
 
 NARROW = Method(name="narrow", title="Narrow", fit=lambda fitting: (Narrow(shift_of(fitting)), {}), grounding=Narrow)
-
-
-class Wide(Shifted):
-    """Tells a scatter of other states than these."""
-
-    kind = "shifted, wide"
-
-    def scatter(self, episodes: PairedEpisodes) -> Tensor:
-        return torch.eye(len(self.shift) + 1)
-
-
-WIDE = Method(name="wide", title="Wide", fit=lambda fitting: (Wide(shift_of(fitting)), {}), grounding=Wide)

@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from typing import Annotated, ClassVar, Self
+from typing import Annotated
 
 from pydantic import AfterValidator
 
@@ -28,9 +28,6 @@ NoiseRange = Annotated[Range, _range("from 0 up", lambda least: least >= 0)]
 class Variation(Config):
     """Ranges of the P parameters of an episode, drawn uniformly; by default all are the plain simulator's."""
 
-    steering: ClassVar[tuple[str, ...]] = ()  # what replays of recordings identify; noise brings none closer to any
-    sensing: ClassVar[tuple[str, ...]] = ()  # scales of sensors, plain in replays: they would hide errors of the motion
-
     @staticmethod
     def of_json(ranges: Mapping[str, Sequence[float]]) -> "Variation":
         """Return the variation whose `model_dump` was written to JSON."""
@@ -42,14 +39,6 @@ class Variation(Config):
     def names(self) -> tuple[str, ...]:
         """The parameters, in the order of their columns."""
         return tuple(type(self).model_fields)
-
-    def noiseless(self) -> "Variation":
-        """Return the same ranges, with noise and sensors as in the plain simulator."""
-        return type(self)(**{name: getattr(self, name) for name in self.steering})
-
-    def replayed(self) -> Self:
-        """Return the same ranges, with scales of sensors as in the plain simulator."""
-        return self.model_copy(update={name: getattr(type(self)(), name) for name in self.sensing})
 
     def ranges(self) -> Tensor:
         """Return lower and upper end of every parameter, (P, 2), in the order of `names`."""
@@ -71,8 +60,6 @@ class Variation(Config):
 class PlanarVariation(Variation):
     """Ranges for a robot in a plane; positions identify only the product of friction, action scale and timestep."""
 
-    steering: ClassVar[tuple[str, ...]] = ("friction", "action_scale", "heading_bias_deg", "timestep_scale")
-
     friction: FactorRange = (1.0, 1.0)  # factor on the speed that a command gives
     action_scale: Range = (0.0, 0.0)  # relative error of commands: 0.1 makes them 10 % longer
     action_noise: NoiseRange = (0.0, 0.0)  # standard deviation of Gaussian noise on commands of ±1 per axis
@@ -85,8 +72,6 @@ class PlanarVariation(Variation):
 class BallVariation(PlanarVariation):
     """Ranges for a robot in a plane, with a ball."""
 
-    steering: ClassVar[tuple[str, ...]] = (*PlanarVariation.steering, "ball_friction", "contact_direction_deg")
-
     ball_friction: FactorRange = (1.0, 1.0)  # factor on the deceleration of the rolling ball
     ball_position_noise_m: NoiseRange = (0.0, 0.0)  # half width of the uniform noise on observed positions of the ball
     ball_velocity_noise_m_s: NoiseRange = (0.0, 0.0)  # half width of the uniform noise on its observed velocities
@@ -96,17 +81,12 @@ class BallVariation(PlanarVariation):
 class CommandVariation(Variation):
     """Ranges for any robot: of what reaches it of the commands."""
 
-    steering: ClassVar[tuple[str, ...]] = ("action_scale",)
-
     action_scale: Range = (0.0, 0.0)  # relative error of commands: 0.1 makes them 10 % longer, up to their bounds
     action_noise: NoiseRange = (0.0, 0.0)  # standard deviation of Gaussian noise on commands, which range over ±1
 
 
 class JointVariation(Variation):
     """Ranges for joints under position control; angles identify little but the quotient of friction and timestep."""
-
-    steering: ClassVar[tuple[str, ...]] = ("friction", "action_scale", "timestep_scale")
-    sensing: ClassVar[tuple[str, ...]] = ("observation_scale",)
 
     friction: FactorRange = (1.0, 1.0)  # factor on the joints' own damping; that of the position control stays
     action_scale: Range = (0.0, 0.0)  # relative error of commands: 0.1 makes them 10 % longer

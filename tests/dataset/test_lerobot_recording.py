@@ -25,28 +25,6 @@ from astra_data.io.hub.sharing import push
 
 KEPT = (0, 2, 3)
 """Episodes of `arm` with a next state."""
-GLIDER = """
-import torch
-from astra_data import Column
-
-
-class Glider:
-    abstract_state = Column("abstract.state", size=2, names=("x", "y"))
-    parameters = {"timestep_s": 0.1}
-
-    def __init__(self, num_envs):
-        self.state = torch.zeros(num_envs, 2)
-
-    @staticmethod
-    def abstraction(state):
-        return state[:, :2]
-
-    def reset_to(self, state, rows=None):
-        self.state = state.clone()
-
-    def step(self, action):
-        return self.state + 0.1 * action
-"""
 
 
 @pytest.fixture

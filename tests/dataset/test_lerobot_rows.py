@@ -12,7 +12,6 @@ from astra_data.dataset.format import DEFAULT_COLUMNS
 from astra_data.dataset.lerobot_recording import RECORDED_TASK, Rows, declared_columns, found_in, name_of
 from astra_data.dataset.plain import PlainColumn, Run
 
-More = Mapping[str, Array] | None
 STEPS = 4
 
 

@@ -18,9 +18,6 @@ from astra_data.dataset.columns import Column, Episode
 from astra_data.dataset.format import data_schema
 from astra_data.dataset.writer import load_staged, write_staged
 
-STEPS_OF_THE_RECORDED = 20
-EPISODES_OF_THE_RECORDED = 30
-
 
 def leftovers(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir() if path.name.startswith("."))

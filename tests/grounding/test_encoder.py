@@ -165,17 +165,6 @@ def test_closed_form_agrees_with_sampling() -> None:
     assert exact > 20 * error  # the comparison above can tell something
 
 
-def gradient(bandwidths: Tensor) -> float:
-    """Return the gradient's norm between unrelated latents of size 64."""
-    torch.manual_seed(0)
-    source, target = torch.randn(2, 32, 64)
-    target.requires_grad_()
-    variance = torch.full((32, 64), 0.1)
-    gaussian_mmd(source, variance, target, variance, bandwidths).sum().backward()
-    assert target.grad is not None
-    return float(target.grad.norm(dim=-1).min())
-
-
 def test_target_encoder_clips_normalized_states() -> None:
     encoder = TargetEncoder(3, 2, 1, embedding_size=4, latent_size=4, position_octaves=2)
     state, goal = 2.0 + 3.0 * torch.randn(5000, 3), torch.randn(5000, 2)

@@ -215,6 +215,7 @@ def test_causal_compass_finds_the_parameters_that_were_planted(tmp_path: Path) -
     again = type(grounding).from_file(*grounding.to_file(), "cpu")
     assert again.variation == grounding.variation and grounding.variation.friction == (point["friction"],) * 2
     assert grounding.variation.position_noise_m == (0.0, 2e-3)  # noise is not identified
+    assert grounding.for_replay().variation == type(ranges)(**{name: (value, value) for name, value in point.items()})
 
 
 NAMED = ("delta_action", "nas_golemo", "sb3_ppo", "parameters", "gru_ensemble")

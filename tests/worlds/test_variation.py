@@ -37,16 +37,6 @@ def test_it_survives_json_and_knows_its_parameters(kind: type[Variation]) -> Non
     variation = kind(**{name: (0.8, 1.2) for name in kind.model_fields})
     assert Variation.of_json({name: list(ends) for name, ends in variation.model_dump().items()}) == variation
     assert variation.names == tuple(kind.model_fields)
-    # What steers stays, noise and sensors become plain.
-    noiseless = variation.noiseless()
-    assert type(noiseless) is kind
-    changed = {name for name in kind.model_fields if getattr(noiseless, name) != (0.8, 1.2)}
-    assert changed == {name for name in kind.model_fields if "noise" in name or "observation" in name}
-    assert changed == set(variation.names) - set(kind.steering)
-    assert all(getattr(noiseless, name) == getattr(kind(), name) for name in changed)
-    replayed = variation.replayed()
-    sensed = {name for name in kind.model_fields if getattr(replayed, name) != (0.8, 1.2)}
-    assert sensed == set(kind.sensing) == {name for name in kind.model_fields if "observation" in name}
 
 
 def test_noise_carries_no_command_beyond_one() -> None:

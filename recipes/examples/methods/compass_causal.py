@@ -20,6 +20,10 @@ from astra_data.worlds.variation import Variation
 
 HIDDEN, FEATURES = 64, 32
 
+# What replays identify: noise brings none closer to a recording, and scales of sensors would hide errors of the motion.
+STEERING = {"friction", "action_scale", "heading_bias_deg", "timestep_scale", "ball_friction", "contact_direction_deg"}
+SENSING = "observation_scale"
+
 
 class CompassConfig(Config):
     iterations: Count = 5
@@ -129,7 +133,8 @@ class IdentifiedParameters(NoGrounding):
         return super().simulator(task, num_envs, device, variation=self.variation, **others)
 
     def for_replay(self):
-        return IdentifiedParameters(self.variation.noiseless())
+        ranges = self.variation
+        return IdentifiedParameters(type(ranges)(**ranges.model_dump(include=STEERING)))
 
     def to_file(self):
         return {"ranges": self.variation.ranges()}, {"variation": self.variation.model_dump()}
@@ -145,8 +150,8 @@ def within(value, ends):
 
 def fit(fitting):
     task, config, ranges = fitting.task, fitting.settings, fitting.task.varied.wide
-    kind, box = type(ranges), ranges.replayed()
-    point = {name: within(getattr(kind(), name)[0], getattr(box, name)) for name in box.steering}
+    kind, box = type(ranges), type(ranges)(**ranges.model_dump(exclude={SENSING}))
+    point = {name: within(plain[0], getattr(box, name)) for name, plain in kind() if name in STEERING}
     for iteration in range(config.iterations):
         point, box = improved(fitting, point, box, f"compass {iteration}")
         fitting.progress((iteration + 1) / config.iterations, str({n: round(v, 3) for n, v in point.items()}))
@@ -185,7 +190,7 @@ def improved(fitting, point, box, name):
     torch.manual_seed(derive(fitting.seed, f"{name} model"))
     model = fit_causes(cause, (difference / scale).flatten(0, 1), config, len(varied))
     mask = (model.logits.sigmoid() > config.mask_threshold).float()
-    steers = torch.tensor([parameter in box.steering for parameter in varied], device=device)
+    steers = torch.tensor([parameter in STEERING for parameter in varied], device=device)
     moves = mask[: len(varied)].any(-1) & steers
     here = box.normal(parameters_at(kind, point))[columns].to(device)
     low, high = box.ranges()[columns].unbind(-1)
