@@ -216,7 +216,7 @@ class DrivenAnt(gymnasium.ActionWrapper[Any, Any, Any]):
         """Make one."""
         super().__init__(gymnasium.make(GYMNASIUM_ID))
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float64)
-        self._controller = VelocityController.load()
+        self._controller = VelocityController()
         self._data: Any = self.unwrapped.ant_env.data  # type: ignore[attr-defined]
 
     def action(self, action: Any) -> Any:  # noqa: ANN401

@@ -5,7 +5,6 @@ import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import ClassVar
 
 import numpy as np
 import torch
@@ -17,8 +16,6 @@ from astra_data.core.errors import BadInputError
 from astra_data.grounding.encoder import HistoryEncoder, mlp
 from astra_data.policies.learner import PACKAGE_KINDS, ActingPolicy
 from astra_data.worlds.user_code import explained
-
-_SMALLEST_SQUASHED = 1e-6 - 1.0  # actions beyond it are taken for it, since the tanh of no number is -1
 
 
 @dataclass(frozen=True)
@@ -59,8 +56,6 @@ def features_of(
 class Policy(nn.Module, ABC):
     """Acts on observations and its memory of them, an argument and a result, `hidden` (B, M), never kept."""
 
-    squashes: ClassVar[bool] = False  # whether actions are the tanh of draws from the Gaussian that `policy` returns
-
     def __init__(self, shape: PolicyShape) -> None:
         super().__init__()
         self.shape = shape
@@ -87,11 +82,7 @@ class Policy(nn.Module, ABC):
 
     def log_prob(self, features: Tensor, action: Tensor) -> Tensor:
         """Return the log-density (...) of `action` (..., A) for `features` (..., F)."""
-        if not self.squashes:
-            return gaussian_log_prob(*self.policy(features), action)
-        inside = action.clamp(_SMALLEST_SQUASHED, -_SMALLEST_SQUASHED)
-        drawn = gaussian_log_prob(*self.policy(features), inside.atanh())
-        return drawn - torch.log1p(-inside.square()).sum(-1)
+        return gaussian_log_prob(*self.policy(features), action)
 
     @abstractmethod
     def act(self, features: Tensor, generator: torch.Generator | None = None) -> Tensor:
@@ -146,14 +137,13 @@ class ActorCritic(Policy):
         return torch.as_tensor(self.critic(features).squeeze(-1))
 
 
+_SMALLEST_SQUASHED = 1e-6 - 1.0  # actions beyond it are taken for it, since the tanh of no number is -1
 _SMALLEST_SCALE = 1e-3
 _UNIT_SCALE = math.log(math.e - 1.0)  # its softplus is 1
 
 
 class SoftActor(Policy):
     """A Gaussian whose location and scale both depend on the features; actions are the tanh of samples."""
-
-    squashes = True
 
     def __init__(self, shape: PolicyShape) -> None:
         super().__init__(shape)
@@ -163,6 +153,11 @@ class SoftActor(Policy):
         """Return location and scale (..., A) of the Gaussian, before the tanh, for `features` (..., F)."""
         loc, width = self.actor(features).chunk(2, dim=-1)
         return loc, functional.softplus(width + _UNIT_SCALE) + _SMALLEST_SCALE
+
+    def log_prob(self, features: Tensor, action: Tensor) -> Tensor:
+        """Return the log-density (...) of `action` (..., A), the tanh of what was drawn, for `features` (..., F)."""
+        inside = action.clamp(_SMALLEST_SQUASHED, -_SMALLEST_SQUASHED)
+        return super().log_prob(features, inside.atanh()) - torch.log1p(-inside.square()).sum(-1)
 
     def sample(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Draw actions (..., A), through which gradients flow; return them and their log-density (...)."""
@@ -271,15 +266,6 @@ class Student(ActorCritic):
         newest = torch.cat([observation, previous_action], dim=-1)
         history = torch.cat([history[:, newest.shape[1] :], newest], dim=-1)
         return torch.cat([features, self.adaptation(history)], dim=-1), torch.cat([memory, history], dim=-1)
-
-    def remember_sequence(self, observation: Tensor, previous_action: Tensor, hidden: Tensor, start: Tensor) -> Tensor:
-        """Return the features (B, T, F) of T steps, from `hidden`; `start` (B, T) is 1 at new episodes."""
-        features = []
-        for step in range(observation.shape[1]):
-            hidden = hidden * (1.0 - start[:, step, None])
-            seen, hidden = self.remember(observation[:, step], previous_action[:, step], hidden)
-            features.append(seen)
-        return torch.stack(features, dim=1)
 
 
 class Critics(nn.Module):

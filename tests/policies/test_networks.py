@@ -63,7 +63,7 @@ def test_the_likeliest_action_is_taken_unless_one_is_drawn(index: int) -> None:
     location, scale = (values[0].detach() for values in policy.policy(features))
     likeliest, drawn = policy.act(features), policy.act(features, torch.Generator().manual_seed(0))
     assert drawn.abs().max() <= 1.0
-    if policy.squashes:
+    if isinstance(policy, networks.SoftActor):
         torch.testing.assert_close(likeliest[0], torch.tanh(location))
         drawn = torch.atanh(drawn.double().clamp(-1 + 1e-7, 1 - 1e-7)).float()
     else:
@@ -80,7 +80,7 @@ def test_the_density_of_an_action_is_that_of_its_distribution() -> None:
     for policy in policies(0):
         normal = torch.distributions.Normal(*policy.policy(OBSERVATION))
         distribution: torch.distributions.Distribution = normal
-        if policy.squashes:
+        if isinstance(policy, networks.SoftActor):
             tanh = torch.distributions.TanhTransform()
             distribution = torch.distributions.TransformedDistribution(normal, tanh)
         expected = distribution.log_prob(action).sum(-1)
@@ -149,22 +149,3 @@ def test_a_student_acts_like_its_teacher_where_it_estimates_well_and_holds_nothi
     assert not any(name.startswith("encoder") for name in student.state_dict())
     learned = {name.split(".")[0] for name, value in student.named_parameters() if value.requires_grad}
     assert learned == {"adaptation"}
-
-
-@torch.no_grad()
-def test_a_student_remembers_a_sequence_as_it_does_step_by_step() -> None:
-    torch.manual_seed(0)
-    student = networks.Student(SHAPE)
-    observation, action = torch.randn(3, 6, 3), torch.randn(3, 6, 2)
-    start = torch.zeros(3, 6)
-    start[1, 4] = 1.0
-    first = torch.randn_like(student.initial_hidden(3))
-    features = student.remember_sequence(observation, action, first, start)
-    hidden = first
-    for step in range(6):
-        hidden = torch.where(start[:, step, None] > 0, student.initial_hidden(3), hidden)
-        seen, hidden = student.remember(observation[:, step], action[:, step], hidden)
-        torch.testing.assert_close(features[:, step], seen)
-    other = student.remember_sequence(observation, action, torch.randn_like(first), start)
-    torch.testing.assert_close(other[1, 4:], features[1, 4:])
-    assert (other[1, :4] - features[1, :4]).abs().max() > 1e-4

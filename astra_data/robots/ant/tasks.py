@@ -1,7 +1,6 @@
 """The ant: its MuJoCo model, its low-level controller of velocities, its environment in a maze, its tasks."""
 
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Sequence
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
@@ -113,18 +112,12 @@ def torques_to_body(torques: Floats, quarters: NDArray[np.intp]) -> Floats:
 class VelocityController:
     """The frozen low-level controller, a ReLU network: world-frame planar velocity command in, joint torques out."""
 
-    def __init__(self, layers: Sequence[tuple[Tensor, Tensor]], torque_scale: float) -> None:
-        """Take (weight, bias) of each layer, and the largest torque as a share of the motors' limit."""
-        self._layers = list(layers)
-        self.torque_scale = torque_scale
-
-    @classmethod
-    def load(cls, path: Path | None = None) -> "VelocityController":
-        """Load weights from `path`, by default the checkpoint shipped with the package."""
-        source = path or Path(str(files("astra_data.robots.ant") / "velocity_controller.safetensors"))
+    def __init__(self) -> None:
+        """Load the checkpoint shipped with the package."""
+        source = Path(str(files("astra_data.robots.ant") / "velocity_controller.safetensors"))
         tensors, _ = load_tensors(source)
-        layers = [(tensors[f"{layer}.weight"], tensors[f"{layer}.bias"]) for layer in range(len(tensors) // 2)]
-        return cls(layers, float(tensors["torque_scale"]))
+        self._layers = [(tensors[f"{layer}.weight"], tensors[f"{layer}.bias"]) for layer in range(len(tensors) // 2)]
+        self._torque_scale = float(tensors["torque_scale"])
 
     def __call__(self, qpos: Floats, qvel: Floats, command: Floats) -> Floats:
         """Return torques (B, 8) in [-1, 1] for `qpos` (B, 15), `qvel` (B, 14) and `command` (B, 2) in m/s."""
@@ -133,7 +126,7 @@ class VelocityController:
         for weight, bias in self._layers[:-1]:
             hidden = torch.nn.functional.linear(hidden, weight, bias).relu()
         squashed = torch.nn.functional.linear(hidden, *self._layers[-1]).tanh()
-        return torques_to_body(self.torque_scale * squashed.double().numpy(), quarters)
+        return torques_to_body(self._torque_scale * squashed.double().numpy(), quarters)
 
 
 class AntMazeEnv(PhysicsTarget, PlanarTarget):
@@ -150,12 +143,11 @@ class AntMazeEnv(PhysicsTarget, PlanarTarget):
         seed: int,
         leg_scale: float = 1.0,
         start_anywhere: bool = False,
-        controller: VelocityController | None = None,
         num_threads: int | None = None,
     ) -> None:
-        """Build B ants; `leg_scale` is a factor on the legs' length, `controller` by default the one shipped."""
+        """Build B ants; `leg_scale` is a factor on the legs' length."""
         super().__init__(objective, num_envs, start_anywhere=start_anywhere)
-        self.controller = controller or VelocityController.load()
+        self.controller = VelocityController()
         model = ant_model(objective.maze, leg_scale=leg_scale)
         self.physics = BatchedPhysics(
             model, num_envs, substeps=CONTROL_SUBSTEPS, watched_geoms=wall_geoms(model), num_threads=num_threads

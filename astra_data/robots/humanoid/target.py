@@ -2,13 +2,12 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, wraps
 from importlib.resources import files
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from astra_data.core.arrays import Bools, Floats, normalized
 from astra_data.core.errors import BadInputError
@@ -60,28 +59,20 @@ def humanoid_model(actuators: Actuators = "positions") -> "mujoco.MjModel":
     return model
 
 
-@dataclass(frozen=True)
-class CommandRanges:
-    """Joint angles of the commands -1 and 1; not in the paper. Random ones over the full ranges make it fall soon."""
+HIP_DEG, KNEE_DEG = (-50.0, 20.0), (-70.0, -2.0)
+"""Joint angles of the commands -1 and 1; not in the paper. Random ones over the full ranges make it fall soon."""
+COMMAND_PARAMETERS = {
+    **{"hip_low_deg": HIP_DEG[0], "hip_high_deg": HIP_DEG[1]},
+    **{"knee_low_deg": KNEE_DEG[0], "knee_high_deg": KNEE_DEG[1]},
+}
+"""The ends of the ranges by name, as datasets record them."""
 
-    hip_deg: tuple[float, float] = (-50.0, 20.0)
-    knee_deg: tuple[float, float] = (-70.0, -2.0)
 
-    @property
-    def parameters(self) -> dict[str, float]:
-        """The ends of the ranges by name, as datasets record them."""
-        ranges = {"hip": self.hip_deg, "knee": self.knee_deg}
-        return {
-            f"{name}_{end}_deg": value
-            for name, ends in ranges.items()
-            for end, value in zip(("low", "high"), ends, strict=True)
-        }
-
-    def targets(self, action: Tensor) -> Tensor:
-        """Return the angles (..., 4) in rad of commands (..., 4), clipped to ±1."""
-        ends = torch.tensor([self.hip_deg, self.knee_deg] * 2, dtype=action.dtype, device=action.device)
-        low, high = torch.deg2rad(ends).unbind(-1)
-        return low + (high - low) * (action.clamp(-1.0, 1.0) + 1.0) / 2.0
+def commanded_angles(action: Tensor) -> Tensor:
+    """Return the angles (..., 4) in rad of commands (..., 4), clipped to ±1."""
+    ends = torch.tensor([HIP_DEG, KNEE_DEG] * 2, dtype=action.dtype, device=action.device)
+    low, high = torch.deg2rad(ends).unbind(-1)
+    return low + (high - low) * (action.clamp(-1.0, 1.0) + 1.0) / 2.0
 
 
 JOINTS_RAD = tuple(0.3 if joint in COMMANDED else 0.025 for joint in range(len(JOINTS)))
@@ -159,7 +150,6 @@ class HumanoidEnv(PhysicsTarget):
         if start_anywhere:
             raise BadInputError("collect.start: expected 'task' for a humanoid, got 'anywhere'")
         self.locomotion, self.num_envs = locomotion, num_envs
-        self.ranges = CommandRanges()
         self._model = humanoid_model(actuators)
         motors = humanoid_model("motors")
         self._torque_per_control = motors.actuator_gear[:, 0] / self._model.actuator_gear[:, 0]
@@ -197,7 +187,7 @@ class HumanoidEnv(PhysicsTarget):
     def step(self, action: Tensor, active: Tensor | None = None) -> Step:
         """Follow the commands `action` (B, 4) for 0.015 s; rows outside `active` (B,) stay."""
         targets = np.zeros((self.num_envs, len(JOINTS)))
-        targets[:, COMMANDED] = self.ranges.targets(action.double()).numpy()
+        targets[:, COMMANDED] = commanded_angles(action.double()).numpy()
         return self.drive(targets, active)
 
     def drive(self, control: Floats, active: Tensor | None = None) -> Step:
@@ -331,25 +321,17 @@ _SPIN = slice(POSITIONS + 3, POSITIONS + 6)
 _RATES = slice(POSITIONS + 6, None)
 
 
-class Phi:
-    """φ of tensors, which takes and returns arrays, too."""
+def _of_arrays_too(phi: Callable[[Tensor], Tensor]) -> Callable[[Any], Any]:
+    """Let φ of tensors take and return arrays, too."""
 
-    def __init__(self, of_tensors: Callable[[Tensor], Tensor]) -> None:
-        self._of_tensors = of_tensors
-        self.__name__, self.__doc__ = of_tensors.__name__, of_tensors.__doc__
+    @wraps(phi)
+    def either(state: Any) -> Any:  # noqa: ANN401
+        return phi(state) if isinstance(state, torch.Tensor) else phi(torch.from_numpy(state)).numpy()
 
-    def __call__[Array: (NDArray[np.float32], Floats, Tensor)](self, state: Array) -> Array:
-        """Return φ of states (..., 47)."""
-        if isinstance(state, torch.Tensor):
-            return self._of_tensors(state)
-        return self._of_tensors(torch.from_numpy(state)).numpy()
-
-    def __reduce__(self) -> str:
-        """Pickle it by its name, as functions are."""
-        return self._of_tensors.__name__
+    return either
 
 
-@Phi
+@_of_arrays_too
 def humanoid_to_walker2d(state: Tensor) -> Tensor:
     """Keep a planar walker: height, pitch, hips and knees, their rates, contacts of feet: (..., 47) to (..., 15)."""
     height, spin = state[..., _HEIGHT], state[..., _SPIN]
@@ -368,13 +350,13 @@ def humanoid_to_walker2d(state: Tensor) -> Tensor:
     return torch.cat([*pose, *rates, (clearance < CONTACT_M).to(state.dtype)], dim=-1)
 
 
-@Phi
+@_of_arrays_too
 def humanoid_to_kinematics(state: Tensor) -> Tensor:
     """Keep the angles in rad and rates in rad/s of all joints: (..., 47) to (..., 34)."""
     return torch.cat([state[..., _JOINTS], state[..., _RATES]], dim=-1)
 
 
-@Phi
+@_of_arrays_too
 def humanoid_to_extended_kinematics(state: Tensor) -> Tensor:
     """Keep joints, center of mass along the heading, its velocity, the torso's up and spin: (..., 47) to (..., 46)."""
     joints, rates = state[..., _JOINTS], state[..., _RATES]

@@ -62,13 +62,12 @@ class HumanoidWalker2d(FreeStates):
         ],
         "torso, legs and foot contacts of a planar walker",
     )
-    abstraction = humanoid.humanoid_to_walker2d
+    abstraction = staticmethod(humanoid.humanoid_to_walker2d)
 
     def __init__(self, num_envs: int, *, num_threads: int | None = None, device: str = "cpu") -> None:
         standing = humanoid.humanoid_to_walker2d(torch.tensor(humanoid.STANDING))
         super().__init__(standing.repeat(num_envs, 1).to(device))
         self.memory = self._sunk(self.state)
-        self.ranges = humanoid.CommandRanges()
         self._model = walker_model()
         self._models = [self._model]
         self._steps = ColdSteps(self._model, num_envs, num_threads)
@@ -76,7 +75,7 @@ class HumanoidWalker2d(FreeStates):
     @property
     def parameters(self) -> dict[str, float]:
         """What a dataset paired with this simulator records about it."""
-        return {"timestep_s": humanoid.TIMESTEP_S, **self.ranges.parameters}
+        return {"timestep_s": humanoid.TIMESTEP_S, **humanoid.COMMAND_PARAMETERS}
 
     def vary(self, parameters: Mapping[str, Tensor]) -> None:
         """Use factors (B, 1) on the joints' damping and on the control step, of as many physics steps, from now on."""
@@ -108,7 +107,7 @@ class HumanoidWalker2d(FreeStates):
         """Follow the commands `action` (B, 4) for one control step; return the new state (B, 15)."""
         motion, sunk = self.state[:, _MOTION].cpu().double(), self.memory[:, 0].cpu()
         motion[:, 0] += sunk
-        targets = self.ranges.targets(action.cpu().double()).numpy()
+        targets = humanoid.commanded_angles(action.cpu().double()).numpy()
         # Before z comes x, which is 0 at the start of every step.
         placed = np.pad(motion.numpy(), ((0, 0), (1, 0)))
         landed = self._steps(self._models, placed, targets, substeps=humanoid.CONTROL_SUBSTEPS)
@@ -132,9 +131,7 @@ class HumanoidKinematics(FreeStates):
 
     action_size = 4
     abstract_state = column(ABSTRACT_STATE, _JOINTS, "angles and rates of all joints")
-    abstraction = humanoid.humanoid_to_kinematics
-
-    ranges = humanoid.CommandRanges()  # joint angles of commands
+    abstraction = staticmethod(humanoid.humanoid_to_kinematics)
 
     def __init__(self, num_envs: int, *, device: str = "cpu") -> None:
         standing = type(self).abstraction(torch.tensor(humanoid.STANDING))
@@ -146,7 +143,7 @@ class HumanoidKinematics(FreeStates):
     @property
     def parameters(self) -> dict[str, float]:
         """What a dataset paired with this simulator records about it."""
-        return {"timestep_s": humanoid.TIMESTEP_S, **self.ranges.parameters}
+        return {"timestep_s": humanoid.TIMESTEP_S, **humanoid.COMMAND_PARAMETERS}
 
     def vary(self, parameters: Mapping[str, Tensor]) -> None:
         """Use factors (B, 1) on the joints' damping and on the control step from the next step on."""
@@ -162,7 +159,7 @@ class HumanoidKinematics(FreeStates):
         """Return angles and rates (B, 34) of all joints after the step."""
         angles = self.state[:, :_COUNT]
         target = torch.zeros_like(angles)
-        target[:, humanoid.COMMANDED] = self.ranges.targets(action)
+        target[:, humanoid.COMMANDED] = humanoid.commanded_angles(action)
         left = (target - angles) * torch.exp(-self._approach * self._timestep_s)
         return torch.cat([target - left, self._approach * left], dim=-1)
 
@@ -180,7 +177,7 @@ class HumanoidExtendedKinematics(HumanoidKinematics):
         "angles and rates of all joints; along the heading, centre of mass, from between the feet, "
         "and its velocity; which way is up from the torso, and how fast it turns",
     )
-    abstraction = humanoid.humanoid_to_extended_kinematics
+    abstraction = staticmethod(humanoid.humanoid_to_extended_kinematics)
 
     def __init__(self, num_envs: int, *, follow_s: float = 0.3, device: str = "cpu") -> None:
         """Build B standing humanoids; `follow_s` is the time constant of the body's velocity and angular velocity."""
@@ -221,7 +218,7 @@ class Walking(Objective):
     action_size = len(humanoid.COMMANDED)
     is_lasting = True
     spread: ClassVar[tuple[float, ...]]  # typical deviation of each entry of a state from standing, (X,)
-    phi: ClassVar[humanoid.Phi]  # φ of target states (count, 47), (count, X)
+    phi: ClassVar["staticmethod[[Floats], Floats]"]  # φ of target states (count, 47), (count, X)
 
     locomotion: humanoid.Locomotion = field(default_factory=humanoid.Locomotion)  # rewards and starts of the target
     failure_reward: float = field(default=-5.0, kw_only=True)  # a step that ends in a fall is not paid for staying up
@@ -261,7 +258,7 @@ class PlanarWalking(Walking):
         *(humanoid.VELOCITY_M_S, humanoid.VELOCITY_M_S, humanoid.SPIN_RAD_S, *_LEG_RATES_RAD_S),
         *(1.0, 1.0),
     )
-    phi = humanoid.humanoid_to_walker2d
+    phi = staticmethod(humanoid.humanoid_to_walker2d)
 
     def missed(self, state: Tensor, goal: Tensor) -> Tensor:
         """Return which torsos of states (B, 15) are outside of the healthy heights, (B,) bool."""
@@ -284,7 +281,7 @@ class JointWalking(Walking):
     """Walking of the joints alone, states (..., 34); they show no falls, so every episode succeeds."""
 
     spread = (*humanoid.JOINTS_RAD, *humanoid.JOINT_RATES_RAD_S)
-    phi = humanoid.humanoid_to_kinematics
+    phi = staticmethod(humanoid.humanoid_to_kinematics)
 
     def velocity(self, before: Tensor, after: Tensor) -> Tensor:
         """Return the velocity of a level torso over its lower foot, which does not slip, (B,) in m/s."""
@@ -302,7 +299,7 @@ class MassWalking(Walking):
         *(*JointWalking.spread, *[humanoid.POSITION_M] * 3, *[humanoid.VELOCITY_M_S] * 3),
         *(*[humanoid.LEAN_RAD] * 3, *[humanoid.SPIN_RAD_S] * 3),
     )
-    phi = humanoid.humanoid_to_extended_kinematics
+    phi = staticmethod(humanoid.humanoid_to_extended_kinematics)
 
     lowest_mass_m: float = 0.65
     """A humanoid whose center of mass is lower has fallen, on average two steps before the target's episode
@@ -426,7 +423,7 @@ def _task(name: str, walking: Walking, kind: Kind, beyond: Callable[[Tensor], Te
         timestep_s=humanoid.TIMESTEP_S,
         simulator_id=f"humanoid_{name}",
         photograph=photograph,
-        facts={"stiffness": humanoid.STIFFNESS, "damping": humanoid.DAMPING, **humanoid.CommandRanges().parameters},
+        facts={"stiffness": humanoid.STIFFNESS, "damping": humanoid.DAMPING, **humanoid.COMMAND_PARAMETERS},
         varied=Varied(VariedHumanoid, RANDOMIZED_ACTIONS, WIDE_RANGES),
     )
 

@@ -141,7 +141,7 @@ def test_torques_to_body_undoes_the_view() -> None:
 
 @pytest.mark.parametrize("command", [[0.8, 0.0], [0.0, -0.8], [-0.5, 0.5]])
 def test_the_shipped_controller_walks_as_told(command: list[float]) -> None:
-    controller, model = tasks.VelocityController.load(), tasks.ant_model()
+    controller, model = tasks.VelocityController(), tasks.ant_model()
     data = mujoco.MjData(model)
     data.qpos[8::2] = SIGNS
     mean = np.zeros(2)

@@ -12,9 +12,9 @@ from astra_data.robots.humanoid.target import (
     CONTACT_M,
     FEET,
     TIMESTEP_S,
-    CommandRanges,
     HumanoidEnv,
     Locomotion,
+    commanded_angles,
     humanoid_model,
     humanoid_to_walker2d,
 )
@@ -138,7 +138,7 @@ def test_walking_on_it_equals_mujoco_that_is_not_interrupted() -> None:
         assert depths[row] == pytest.approx(sunk, abs=1e-6)
         data.qpos[1] += sunk
         for step, action in enumerate(actions[:, row]):
-            data.ctrl[:] = CommandRanges().targets(action.double()).numpy()
+            data.ctrl[:] = commanded_angles(action.double()).numpy()
             mujoco.mj_step(model, data, 5)
             expected = np.concatenate([data.qpos[1:] - [sunk, *[0.0] * 5], data.qvel])
             if step == 0:
@@ -169,7 +169,7 @@ def test_joints_approach_their_targets(kind: Kind) -> None:
     action = torch.tensor([[-0.5, -0.2, 0.7, 9.0]])
     for _ in range(7):
         state = simulator.step(action)[0]
-    targets = CommandRanges().targets(action[0])
+    targets = commanded_angles(action[0])
     time_s = 7 * 0.015
     # Gains 200 and 10; hips are damped by 5, knees by 1.
     for joint, target, damping in zip(COMMANDED, targets.tolist(), [5.0, 1.0, 5.0, 1.0], strict=True):

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from astra_data.core.errors import BadInputError
-from astra_data.robots.humanoid.target import COMMANDED, JOINTS, CommandRanges, HumanoidEnv, Locomotion, humanoid_model
+from astra_data.robots.humanoid import target as humanoid
+from astra_data.robots.humanoid.target import COMMANDED, JOINTS, HumanoidEnv, Locomotion, humanoid_model
 
 
 def test_joints_are_listed_as_the_model_lists_them() -> None:
@@ -42,7 +43,7 @@ def test_motors_are_replaced_by_position_control_with_their_torques() -> None:
 
 def test_commands_span_their_ranges_and_are_clipped() -> None:
     action = torch.tensor([[-1.0, -1.0, -1.0, -1.0], [0.0, 1.0, 9.0, -9.0]])
-    degrees = torch.rad2deg(CommandRanges().targets(action))
+    degrees = torch.rad2deg(humanoid.commanded_angles(action))
     expected = torch.tensor([[-50.0, -70.0, -50.0, -70.0], [-15.0, -2.0, 20.0, -70.0]])
     torch.testing.assert_close(degrees, expected)
 

@@ -130,7 +130,8 @@ def moving(kind: Kind, count: int) -> Tensor:
     generator = torch.Generator().manual_seed(0)
     for _ in range(20):
         env.step(2 * torch.rand(count, 4, generator=generator) - 1)
-    return kind.abstraction(env.state)
+    state: Tensor = kind.abstraction(env.state)
+    return state
 
 
 def varied(kind: Kind, state: Tensor, variation: JointVariation) -> tasks.VariedHumanoid:
@@ -181,7 +182,7 @@ def test_friction_and_timestep_change_how_far_joints_get(kind: Kind) -> None:
     state = kind(1).state.repeat(2, 1)
     simulator = varied(kind, state, JointVariation(friction=(2.0, 2.0), timestep_scale=(1.5, 1.5)))
     landed = simulator.step(ACTION.expand(2, 4))[0]
-    targets = humanoid.CommandRanges().targets(ACTION[0]).tolist()
+    targets = humanoid.commanded_angles(ACTION[0]).tolist()
     for joint, target, damping in zip(humanoid.COMMANDED, targets, [5.0, 1.0, 5.0, 1.0], strict=True):
         rate = 200 / (10 + 2 * damping)
         left = math.exp(-rate * 1.5 * 0.015)
@@ -204,7 +205,7 @@ def test_walkers_have_the_damping_and_the_time_that_they_were_given() -> None:
         model.opt.timestep *= simulator.parameters[row, simulator.variation.names.index("timestep_scale")]
         data = mujoco.MjData(model)
         data.qpos[1:], data.qvel[:] = state[row, :6].numpy(), state[row, 6:13].numpy()
-        data.ctrl[:] = humanoid.CommandRanges().targets(ACTION[0].double()).numpy()
+        data.ctrl[:] = humanoid.commanded_angles(ACTION[0].double()).numpy()
         mujoco.mj_step(model, data, 5)
         assert data.time == pytest.approx(0.015 * scale[row])
         landed = torch.tensor([*data.qpos[1:], *data.qvel]).float()
