@@ -1,7 +1,6 @@
 """Arguments of several commands, options from the models of settings, and what several commands do."""
 
 import ast
-import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import wraps
@@ -55,20 +54,6 @@ def task_at(name: str) -> str:
     return name
 
 
-def _stage(name: str | None) -> str | None:
-    from astra_data.core.config import did_you_mean
-
-    if name is not None and name not in STAGE_NAMES:
-        raise BadInputError(f"unknown stage '{name}'{did_you_mean(name, STAGE_NAMES)}")
-    return name
-
-
-def _device(name: str) -> str:
-    if not re.fullmatch(r"cpu|cuda(:\d+)?", name):
-        raise BadInputError(f"expected a device such as cpu, cuda or cuda:1, got '{name}'")
-    return name
-
-
 _PLACES = "a folder, name@data-1.2.0, or a name (for its highest version)"
 _HAS_ITS_OWN = "The settings below are not for a recipe, which has its own."
 DatasetName = Annotated[str, typer.Argument(metavar="DATASET", help=f"A dataset: {_PLACES}.")]
@@ -97,7 +82,7 @@ Methods = Annotated[
     list[str] | None, typer.Option("--method", metavar="ROW", help="Run only this row; may be repeated.")
 ]
 Seeds = Annotated[list[int] | None, typer.Option("--seed", help="Run only this seed of the recipe; may be repeated.")]
-Device = Annotated[str, typer.Option(help="PyTorch device for the networks: cpu, cuda, cuda:1, …", callback=_device)]
+Device = Annotated[str, typer.Option(help="PyTorch device for the networks: cpu, cuda, cuda:1, …")]
 Jobs = Annotated[
     int | None,
     typer.Option(min=1, help="Number of parallel processes.", show_default="one per core; 2 with --device cuda"),
@@ -109,7 +94,6 @@ Until = Annotated[
         metavar="STAGE",
         help=f"Stop after this stage: {', '.join(STAGE_NAMES)}.",
         show_default="all",
-        callback=_stage,
         autocompletion=lambda: [*STAGE_NAMES],
     ),
 ]

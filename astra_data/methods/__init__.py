@@ -16,7 +16,6 @@ from astra_data.methods.rma import RMA
 from astra_data.policies.learner import add_policy_kind
 from astra_data.policies.train import InSimulator, UserLearner
 from astra_data.worlds.user_code import offered, user_object
-from astra_data.worlds.variation import Variation
 
 METHODS: dict[str, Method] = {
     method.name: method
@@ -89,8 +88,6 @@ def _faults(method: Method) -> Iterator[str]:
             f"has settings of {table.model.__name__}, which is no astra_data.core.config.Config: expected "
             f"class {table.model.__name__}(Config)"
         )
-    elif issubclass(table.model, Variation):
-        return  # ranges, which the environment reads
     elif method.configures == "ground" and method.fit is None:
         yield 'has settings that nothing reads: configures="ground" needs fit'
     elif method.configures == "train" and type(method.learn) is InSimulator:

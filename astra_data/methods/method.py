@@ -1,7 +1,7 @@
 """The descriptor of methods: the parts of the pipeline that they use, their settings, how they are shown."""
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 from astra_data.core.config import Config
 from astra_data.grounding.fit import Fit
@@ -24,16 +24,6 @@ class Table:
 
     name: str
     model: type[Config]
-    default: Config | None = None  # the settings where a recipe has no such table; None for those of the model
-
-    @property
-    def usual(self) -> Config:
-        """The settings where a recipe has no such table."""
-        return self.default or self.model()
-
-    def over_usual(self, given: Any) -> Any:  # noqa: ANN401 - checked by whoever asks
-        """Return a recipe's table, which may leave out keys, laid over the usual settings."""
-        return self.default.model_dump() | given if self.default and isinstance(given, dict) else given
 
 
 @dataclass(frozen=True)

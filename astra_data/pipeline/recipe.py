@@ -277,7 +277,7 @@ def with_tables(base: type[Recipe], stages: Iterable[Stage], methods: Iterable[T
     fields["based_on"] = (str | None, Field(default=None, description=about))
     fields["sweep"] = (SweepConfig, SweepConfig())
     for table in methods:
-        fields[table.name] = (Annotated[table.model, BeforeValidator(table.over_usual)], table.usual)
+        fields[table.name] = (table.model, table.model())
     return create_model(base.__name__, __base__=base, __module__=base.__module__, **fields)
 
 

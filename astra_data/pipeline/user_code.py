@@ -38,10 +38,8 @@ class UserMethod(Config):
         given, table = self.model_extra or {}, METHODS[name].table
         if table is None and given:
             raise BadInputError(f"{name}: {self.method} has no settings, got {', '.join(given)}")
-        if table is None or not given:
-            return table.usual if table else None
         try:
-            return validated(table.over_usual(given), table.model, name)
+            return validated(given, table.model, name) if table else None
         except RecipeError as error:
             raise BadInputError(str(error)) from None
 

@@ -36,7 +36,6 @@ from astra_data.policies.simulator_env import (
     training_env,
 )
 from astra_data.worlds.task import Task
-from astra_data.worlds.variation import Variation
 
 if TYPE_CHECKING:
     from astra_data.policies.gymnasium import WatchedEnv
@@ -129,8 +128,8 @@ class InSimulator:
 
     reward: RewardSource = "abstract"  # where the reward comes from, but for the plus settings
     ranges: Literal["randomized", "wide"] | None = None
-    """Which of the task's ranges the simulator's parameters are drawn from, unless the grounding has ranges or
-    the method's own settings are ranges; None where they stay plain."""
+    """Which of the task's ranges the simulator's parameters are drawn from, unless the grounding has ranges; None
+    where they stay plain."""
 
     def __call__(self, training: Training) -> tuple[PolicyFile, dict[str, Any]]:
         """Return the policy and its learning curve."""
@@ -141,13 +140,12 @@ class InSimulator:
 
     def world(self, training: Training, *, shows_parameters: bool = False) -> tuple[SimulatorEnv, Simulation]:
         """Return the environment to train in, and what a policy file records about it."""
-        config, settings = training.config, training.settings
+        config = training.config
         task, episodes, grounding = training.task, training.episodes, training.grounding
         world = WorldConfig(reward=self.reward, data_start_share=config.data_start_share)
         if training.is_plus:
             world = plus(world, command_limit(task, episodes))
-        usual: Variation | None = getattr(task.varied, self.ranges) if self.ranges else None
-        variation = settings if isinstance(settings, Variation) else usual
+        variation = getattr(task.varied, self.ranges) if self.ranges else None
         starts = data_starts(task, world, episodes, grounding)
         simulation = Simulation(world, variation)
         make = partial(training_env, task, simulation, grounding, num_envs=config.num_envs, device=training.device)

@@ -90,7 +90,7 @@ DELTA = f"{EXAMPLES / 'delta_action.py'}:METHOD"
 @pytest.mark.parametrize("simulator", [Rail, NumpyRail])
 def test_a_delta_action_finds_what_was_added_to_the_commands(tmp_path: Path, simulator: type[Rail]) -> None:
     method, task = user_object(DELTA), Task(**GIVEN | {"make_simulator": simulator})
-    given = replace(fitting(tmp_path, 0.1 * 0.5, task), settings=method.table.usual)
+    given = replace(fitting(tmp_path, 0.1 * 0.5, task), settings=method.table.model())
     grounding, _ = method.fit(given)
     windows = given.training.windows
     added, _ = grounding.delta(windows.state, windows.action)
@@ -154,7 +154,7 @@ def test_fitted_parameters_are_those_that_were_planted(
     still = CARTS.limits.normal(torch.zeros(2))
     planted = sys.modules[method.fit.__module__].Response(*map(torch.tensor, (gain, offset, share)), still, delay)
     training, held_out = late_carts(planted, 20, 0), late_carts(planted, 4, 1)
-    given = Fitting(CARTS, GroundConfig(), method.table.usual, training, held_out, 0, "cpu", tmp_path, silent)
+    given = Fitting(CARTS, GroundConfig(), method.table.model(), training, held_out, 0, "cpu", tmp_path, silent)
     grounding, figures = method.fit(given)
     assert figures["delay"] == delay
     for name, values in (("gain", gain), ("offset", offset), ("share", share)):

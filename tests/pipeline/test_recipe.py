@@ -33,10 +33,9 @@ class MyConfig(Config):
 
 
 def test_the_table_of_a_new_method_is_read() -> None:
-    tables = [Table("mine", MyConfig), Table("yours", MyConfig, default=MyConfig(rate=2.0))]
-    model = with_tables(Recipe, STAGES.values(), tables)
+    model = with_tables(Recipe, STAGES.values(), [Table("mine", MyConfig), Table("yours", MyConfig)])
     recipe = validated(BASE | {"mine": {"rate": 0.7}}, model, "r.toml")
-    assert recipe.mine == MyConfig(rate=0.7) and recipe.yours == MyConfig(rate=2.0)
+    assert recipe.mine == MyConfig(rate=0.7) and recipe.yours == MyConfig()
     with pytest.raises(RecipeError, match=r"mine\.rat: unknown key: did you mean 'rate'"):
         validated(BASE | {"mine": {"rat": 0.7}}, model, "r.toml")
 

@@ -23,7 +23,6 @@ from astra_data.policies.running_policy import PolicyFile
 from astra_data.policies.simulator_env import RewardSource, Simulation, WorldConfig
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.task import Task
-from astra_data.worlds.variation import PlanarVariation
 
 TASK = TASKS["antmaze-umaze"]
 PPO = train.PpoTrainConfig(num_envs=4, rollout_steps=4, total_steps=4 * 4 * 3, hidden_sizes=(8, 6), memory_size=5)
@@ -39,7 +38,6 @@ def training(
     *,
     task: Task = TASK,
     grounding: Grounding = NO_GROUNDING,
-    settings: PlanarVariation | None = None,
     progress: Progress = silent,
     seed: int = 0,
 ) -> train.Training:
@@ -52,7 +50,7 @@ def training(
         simulated_next=state + 0.1 * torch.randn_like(state),
         goal=torch.zeros(2, 6, 2),
     )
-    return train.Training(task, config, settings, episodes, grounding, None, seed, "cpu", folder, progress)
+    return train.Training(task, config, None, episodes, grounding, None, seed, "cpu", folder, progress)
 
 
 def grounding() -> HistoryGrounding:

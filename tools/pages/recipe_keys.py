@@ -11,7 +11,7 @@ from pages.markdown import plain, table
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from astra_data.methods import METHODS, tables
+from astra_data.methods import METHODS
 from astra_data.pipeline.recipe import Recipe
 from astra_data.pipeline.stages.registry import STAGES
 
@@ -48,7 +48,7 @@ def _section(name: str, models: list[type[BaseModel]]) -> str:
         )
     if len(models) > 1:
         return _choice(name, models)
-    return _titled(name, models[0], _key_table(models[0].model_fields, _usual(name)))
+    return _titled(name, models[0], _key_table(models[0].model_fields))
 
 
 def _titled(name: str, model: type[BaseModel], keys: str) -> str:
@@ -86,17 +86,11 @@ def _choice(name: str, models: list[type[BaseModel]]) -> str:
     return "\n".join(parts)
 
 
-def _usual(name: str) -> Mapping[str, object]:
-    """Return the defaults of a table that are not its model's."""
-    return tables()[name].usual.model_dump(mode="json") if name in tables() else {}
-
-
-def _key_table(fields: Mapping[str, FieldInfo], usual: Mapping[str, object] | None = None) -> str:
+def _key_table(fields: Mapping[str, FieldInfo]) -> str:
     rows = []
     for key, field in fields.items():
-        default = _default(field, (usual or {}).get(key))
         kind = _kind(field.annotation, field.metadata)
-        rows.append((f"`{key}`", kind, default, unit(key), plain(field.description or "")))
+        rows.append((f"`{key}`", kind, _default(field), unit(key), plain(field.description or "")))
     return f'<div class="keys" markdown>\n\n{table(_HEAD, rows)}\n</div>\n'
 
 
@@ -107,10 +101,10 @@ def unit(key: str) -> str:
     return UNITS[found[1]] if found else ""
 
 
-def _default(field: FieldInfo, usual: object) -> str:
+def _default(field: FieldInfo) -> str:
     if field.is_required():
         return "required"
-    value = field.get_default(call_default_factory=True) if usual is None else usual
+    value = field.get_default(call_default_factory=True)
     return "" if value is None else f"`{json.dumps(value, ensure_ascii=False)}`"
 
 
