@@ -98,21 +98,10 @@ def test_a_dataset_is_augmented_beside_itself(home: Path) -> None:
     assert dataset.description["seeds"]["augment"] == 5
 
 
-@pytest.mark.parametrize(
-    ("options", "told"),
-    [
-        (["--copies", "2", "--episodes", "9"], "augment: episodes: expected either copies or episodes"),
-        (["--rotations", "none", "--no-translations"], "augment: translations: expected rotations or transl"),
-        (["--rotations", "half"], "augment: rotations: expected 'quarter', 'any' or 'none', got 'half'"),
-        (["--held-out-share", "1"], "augment: held_out_share: expected"),
-    ],
-)
-def test_what_cannot_be_augmented_is_told(home: Path, tmp_path: Path, options: list[str], told: str) -> None:
-    assert "no dataset 'walks'" in str(call("augment", "walks", *options).exception)
-    error = call("augment", str(write_fake(tmp_path / "fake").root), *options).exception
-    assert isinstance(error, AstraDataError)
-    with pytest.raises(AstraDataError, match=told):
-        raise error
+def test_what_cannot_be_augmented_is_told(home: Path, tmp_path: Path) -> None:
+    assert "no dataset 'walks'" in str(call("augment", "walks", "--copies", "2").exception)
+    error = call("augment", str(write_fake(tmp_path / "fake").root), "--copies", "2", "--episodes", "9").exception
+    assert isinstance(error, AstraDataError) and "augment: episodes: expected either copies or episodes" in str(error)
     assert not home.exists()
 
 

@@ -82,23 +82,6 @@ def test_what_is_no_target_encoder_is_refused(missing: str, message: str, tmp_pa
         files.load_target_encoder(path)
 
 
-def test_what_a_grounding_of_one_s_own_saves_and_asks_for_is_checked(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path, shifted = tmp_path / "grounding.safetensors", Shifted(torch.ones(2))
-    monkeypatch.setitem(files.kinds(), Shifted.kind, Shifted)
-    monkeypatch.setitem(files.kinds(), Lossy.kind, Shifted)
-    monkeypatch.setattr(Shifted, "to_file", lambda self: ({"offset": self.shift.numpy()}, {}))
-    with pytest.raises(BadInputError, match=r"^Shifted.to_file: 'offset' is a ndarray, expected a torch"):
-        files.save_grounding(path, shifted, no_episodes())
-    assert not path.exists()
-    monkeypatch.setattr(Shifted, "to_file", lambda self: ({"offset": self.shift}, {}))
-    files.save_grounding(path, shifted, no_episodes())
-    told = r"^Shifted.from_file, given the tensors offset and .*, fails with KeyError: 'shift'"
-    with pytest.raises(BadInputError, match=told):
-        files.load_grounding(path)
-
-
 SHIFTED = Shifted(torch.tensor([0.01]))
 
 
@@ -106,6 +89,21 @@ SHIFTED = Shifted(torch.tensor([0.01]))
 def known(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(files.kinds(), Shifted.kind, Shifted)
     monkeypatch.setitem(files.kinds(), Lossy.kind, Shifted)
+
+
+def test_what_a_grounding_of_one_s_own_saves_and_asks_for_is_checked(
+    tmp_path: Path, known: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "grounding.safetensors"
+    monkeypatch.setattr(Shifted, "to_file", lambda self: ({"offset": self.shift.numpy()}, {}))
+    with pytest.raises(BadInputError, match=r"^Shifted.to_file: 'offset' is a ndarray, expected a torch"):
+        files.save_grounding(path, SHIFTED, no_episodes())
+    assert not path.exists()
+    monkeypatch.setattr(Shifted, "to_file", lambda self: ({"offset": self.shift}, {}))
+    files.save_grounding(path, SHIFTED, no_episodes())
+    told = r"^Shifted.from_file, given the tensors offset and .*, fails with KeyError: 'shift'"
+    with pytest.raises(BadInputError, match=told):
+        files.load_grounding(path)
 
 
 @pytest.mark.parametrize(

@@ -252,10 +252,6 @@ def test_trials_by_hand_are_filled_into_the_sheet(folder: Path, predicted: list[
     assert shown.exit_code == 0, shown.output
     assert "round 1, trial 1 of 4: run " in shown.output and "0 trials are made: fill in trials.csv" in shown.output
     lines = sheet.read_text().splitlines()
-    sheet.write_text("\n".join([lines[0], lines[1] + "s", lines[2] + "perhaps", *lines[3:]]))
-    refused, before = CliRunner().invoke(app, command), sheet.read_text()
-    assert "line 3: expected success, failure, void or nothing as result, found perhaps" in str(refused.exception)
-    assert sheet.read_text() == before
     voids, done = [line + "void" for line in lines[1:3]], [line + "s" for line in lines[1:]]
     sheet.write_text("\n".join([lines[0], *voids, *done]))
     shown = CliRunner().invoke(app, command)

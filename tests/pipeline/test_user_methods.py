@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from fake_runs import bare_results
 
-from astra_data.core.errors import BadInputError, RecipeError
+from astra_data.core.errors import RecipeError
 from astra_data.methods import METHODS
 from astra_data.pipeline import run
 from astra_data.pipeline.experiment import load_experiment
@@ -26,13 +26,6 @@ def test_a_place_alone_is_a_method_with_its_usual_settings() -> None:
     plain = UserMethod.model_validate(ENSEMBLE)
     plain.add("plain")
     assert plain.settings("plain") is None
-
-
-def test_those_that_it_does_not_have_are_refused_before_anything_runs() -> None:
-    with pytest.raises(BadInputError, match=r"^delta: memory: expected a whole number"):
-        add_all({"delta": {"method": DELTA, "memory": "much"}})
-    with pytest.raises(BadInputError, match=r"^plain: .* has no settings, got memory"):
-        add_all({"plain": {"method": ENSEMBLE, "memory": 5}})
 
 
 def test_all_of_a_recipe_are_added_as_recipe_json_has_them() -> None:

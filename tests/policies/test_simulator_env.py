@@ -231,16 +231,6 @@ def test_without_settings_it_is_the_plain_simulator(episodes: PairedEpisodes, gr
         assert torch.equal(torch.get_rng_state(), drawn)
 
 
-def test_plus_settings_reach_the_environment_and_leave_the_rest(episodes: PairedEpisodes) -> None:
-    plain = simulator_env.WorldConfig(reward="predicted", data_start_share=0.3)
-    settings = simulator_env.plus(plain, 0.75)
-    changes = {"reward": "priced", "change_penalty": 0.02, "command_limit": 0.75}
-    assert settings.model_dump() == plain.model_dump() | changes
-    starts = simulator_env.data_starts(TASK, settings, episodes, NO_GROUNDING)
-    world = built(settings, NO_GROUNDING, starts=starts)
-    assert world.world == settings
-
-
 @pytest.mark.parametrize(("reward", "prices"), [("abstract", False), ("predicted", True), ("priced", True)])
 def test_a_failure_model_is_used_and_starts_know_what_it_remembers_where_failures_have_a_price(
     reward: Any, prices: bool, episodes: PairedEpisodes, grounding: HistoryGrounding

@@ -26,16 +26,14 @@ def test_means_are_over_episodes_under_the_names_in_the_file(path: Path) -> None
     )
 
 
-@pytest.mark.parametrize("name", ["evaluation.json", "trajectories.safetensors"])
-def test_a_file_that_was_altered_is_not_read(name: str, path: Path) -> None:
+def test_a_file_that_was_altered_is_not_read(path: Path) -> None:
     write_manifest(path.parent, {})
-    assert read_json(Evaluation, path) and read_tensors(path.with_name("trajectories.safetensors"), ())
-    file = path.with_name(name)
-    altered = bytearray(file.read_bytes())
+    assert read_json(Evaluation, path)
+    altered = bytearray(path.read_bytes())
     altered[-5] ^= 1
-    file.write_bytes(altered)
-    with pytest.raises(BadInputError, match=f"{name} was altered since it was made: restore it from a copy"):
-        read_json(Evaluation, file) if name == path.name else read_tensors(file, ())
+    path.write_bytes(altered)
+    with pytest.raises(BadInputError, match=r"evaluation\.json was altered since it was made: restore it"):
+        read_json(Evaluation, path)
 
 
 def test_a_malformed_artifact_is_named_with_every_fault(path: Path) -> None:
@@ -53,9 +51,6 @@ def test_tensors_are_checked_and_become_float64(tmp_path: Path) -> None:
     assert read_tensors(path, ("goal",))["goal"].dtype == np.float64
     with pytest.raises(BadInputError, match=r"expected tensors \['start'\], got \['goal'\]"):
         read_tensors(path, ("goal", "start"))
-    path.write_bytes(path.read_bytes()[:-8])
-    with pytest.raises(BadInputError, match="not a complete safetensors file"):
-        read_tensors(path, ("goal",))
 
 
 def test_the_way_is_that_of_the_robot_in_episodes_that_succeed(path: Path) -> None:

@@ -24,12 +24,6 @@ def test_sizes_are_datasets_of_their_own_one_inside_the_other(tmp_path: Path) ->
         uids = set(made.uids.tolist())
 
 
-def test_episodes_are_never_repeated(tmp_path: Path) -> None:
-    write_fake(tmp_path / "pair")
-    with pytest.raises(BadInputError, match="has 5 episodes, but the subset has 150 % of 4 = 6"):
-        subset(tmp_path / "pair", percent=150, of=4, out=tmp_path / "out", progress=silent)
-
-
 def test_how_many_there_are_of_how_many_is_told(tmp_path: Path) -> None:
     write_fake(tmp_path / "pair")
     notes = list[str]()
