@@ -46,14 +46,6 @@ def run_at(folder: Path) -> Path:
     return folder
 
 
-def task_at(name: str) -> str:
-    """Refuse a task in a file that does not exist; names, and recipes, are looked up later."""
-    file = Path(name.rpartition(":")[0])
-    if file.suffix == ".py" and not file.is_file():
-        raise BadInputError(f"{name}: expected a file {file}, found none: write path.py:TASK")
-    return name
-
-
 _PLACES = "a folder, name@data-1.2.0, or a name (for its highest version)"
 _HAS_ITS_OWN = "The settings below are not for a recipe, which has its own."
 DatasetName = Annotated[str, typer.Argument(metavar="DATASET", help=f"A dataset: {_PLACES}.")]

@@ -23,18 +23,15 @@ def subset(
         int | None, typer.Option(min=1, help="Episodes that count as 100 percent.", show_default="all")
     ] = None,
     seeds: arguments.StoredSeeds = None,
-    stratify: Annotated[
-        str | None, typer.Option(help="Key of the episodes' metadata whose values keep their proportions.")
-    ] = None,
     name: arguments.NewName = None,
     out: arguments.Out = None,
     jobs: arguments.Jobs = None,
     root: arguments.Root = RUNS,
 ) -> None:
     """Write a random subset; with the same seed, smaller subsets are contained in larger ones."""
-    size = {"episodes": episodes, "percent": percent, "of": of}
+    size: dict[str, Any] = {"episodes": episodes, "percent": percent, "of": of}
     if dataset.endswith(".toml"):
-        arguments.refuse(size | {"stratify": stratify, "name": name, "out": out}, "subset", "sweep")
+        arguments.refuse(size | {"name": name, "out": out}, "subset", "sweep")
         arguments.run_stage(Path(dataset), "subset", seeds=seeds, jobs=jobs, root=root)
         return
     seed = arguments.refuse_of_recipes("subset", seeds, jobs)
@@ -42,7 +39,7 @@ def subset(
     from astra_data.dataset.versions import open_dataset
 
     source = open_dataset(dataset)
-    _report(write(source, episodes=episodes, percent=percent, of=of, seed=seed, stratify=stratify, name=name, out=out))
+    _report(write(source, **size, seed=seed, name=name, out=out))
 
 
 def merge(
@@ -77,18 +74,13 @@ def filter_(
     name: arguments.NewName = None,
     out: arguments.Out = None,
 ) -> None:
-    """Write a dataset of the episodes that meet every given condition, or without some of them."""
-    from astra_data.dataset.edit import delete, filter_episodes
+    """Write a dataset of the episodes that meet every given condition, without some of them."""
+    from astra_data.dataset.edit import filter_episodes
     from astra_data.dataset.versions import open_dataset
 
     conditions: dict[str, Any] = {"success": success, "min_return": min_return, "max_return": max_return}
-    conditions |= {"min_length": min_length, "max_length": max_length}
-    if without:
-        if given := [f"--{key.replace('_', '-')}" for key, value in conditions.items() if value is not None]:
-            raise BadInputError(f"--without goes alone: leave out {', '.join(given)}, or filter twice")
-        _report(delete(open_dataset(dataset), without, name=name, out=out))
-    else:
-        _report(filter_episodes(open_dataset(dataset), **conditions, name=name, out=out))
+    conditions |= {"min_length": min_length, "max_length": max_length, "without": without or ()}
+    _report(filter_episodes(open_dataset(dataset), **conditions, name=name, out=out))
 
 
 def trim(

@@ -59,7 +59,7 @@ def check(
     for name, of_task in zip(recipes, is_task, strict=True):
         try:
             if of_task:
-                _check_task(arguments.task_at(name))
+                _check_task(name)
             else:
                 faults += _check_recipe(arguments.recipe_at(Path(name)), root, verify)
         except AstraDataError as error:
@@ -312,7 +312,6 @@ def collect(
         arguments.run_stage(Path(task), "collect", seeds=seeds, jobs=jobs, root=root)
         return
     seed = arguments.refuse_of_recipes("collect", seeds, jobs) or 0
-    arguments.task_at(task)
     # Torch's idle threads would slow down the physics; it is not loaded yet.
     os.environ["OMP_NUM_THREADS"] = "1"
     with arguments.resumable("run the same command with --resume to continue"):
@@ -342,7 +341,6 @@ def pair(
         raise BadInputError("pair: with a dataset, leave out --seed and --jobs (these are for recipes)")
     if simulator is None:
         raise BadInputError("pair: expected --simulator: a task or path.py:MySimulator")
-    arguments.task_at(simulator)
     from astra_data.dataset.versions import locate
 
     _make("pair", simulator, settings, dataset=locate(dataset), name=name, out=out)
@@ -373,7 +371,6 @@ def label(
     out: arguments.Out = None,
 ) -> None:
     """Compute the goals, rewards, successes and failures that a log lacks, as a task defines them."""
-    arguments.task_at(task)
     from astra_data.dataset.versions import locate
 
     _make("label", task, None, data=locate(dataset), seed=seed, name=name, out=out)

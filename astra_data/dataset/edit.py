@@ -1,6 +1,5 @@
-"""New versions of a dataset with other episodes: subset, delete, filter and merge; nothing is edited in place."""
+"""New versions of a dataset with other episodes: subset, filter and merge; nothing is edited in place."""
 
-from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -8,12 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from astra_data.core.config import did_you_mean, only_given
+from astra_data.core.config import only_given
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import first_few
 from astra_data.dataset.columns import REWARD, Scalar, distinct_uids, renamed_metadata
 from astra_data.dataset.compare import schema_differences
-from astra_data.dataset.description import permutation
 from astra_data.dataset.inspection import outcome_of
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import next_version
@@ -32,7 +30,6 @@ def subset(
     percent: int | None = None,
     of: int | None = None,
     seed: int | None = None,
-    stratify: str | None = None,
     always: Collection[int] = (),
     name: str | None = None,
     out: Path | None = None,
@@ -47,7 +44,6 @@ def subset(
         percent: their share in per cent, which may exceed 100, of
         of: a number of episodes, by default all.
         seed: of the permutation whose first episodes are taken, by default that of `source`.
-        stratify: a key of the episodes' metadata; each of its values keeps its share.
         always: uids of episodes that every subset has; numbers and shares are of the others.
         name: of the new dataset; by default it is the next version of `source`.
         out: its folder, by default under `versions.home()`.
@@ -76,9 +72,6 @@ def subset(
     chosen = source.subset_seed if seed is None else seed
     config: dict[str, Any] = {"episodes": count, "percent": percent, "of": of, "seed": chosen}
     order = source.uids[source.subset(len(source), chosen)].tolist()
-    if stratify:
-        order, strata = _stratified(source, stratify, chosen)
-        config |= {"stratify": stratify, "strata": strata}
     taken = [uid for uid in order if uid not in always][:count]
     return _write(source, {*always, *taken}, stage="subset", config=config, name=name, out=out, seed=chosen)
 
@@ -88,7 +81,7 @@ def share(percent: int, episodes: int) -> int:
     return (percent * episodes + 50) // 100
 
 
-def check_uids(dataset: Dataset, uids: Sequence[int]) -> None:
+def check_uids(dataset: Dataset, uids: Collection[int]) -> None:
     """Raise a BadInputError unless `dataset` has the episodes `uids`."""
     known = sorted(dataset.uids.tolist())
     if unknown := sorted(set(uids) - set(known)):
@@ -96,18 +89,10 @@ def check_uids(dataset: Dataset, uids: Sequence[int]) -> None:
         raise BadInputError(f"{dataset.reference} has no episode {first_few(unknown, MOST_UIDS)}; {its}")
 
 
-def delete(source: Dataset, uids: Sequence[int], *, name: str | None = None, out: Path | None = None) -> Path:
-    """Write `source` without the episodes `uids`."""
-    check_uids(source, uids)
-    if not uids:
-        raise BadInputError("expected the uids of episodes to leave out, got none")
-    config = {"episodes": sorted(set(uids))}
-    return _write(source, set(source.uids.tolist()) - set(uids), stage="delete", config=config, name=name, out=out)
-
-
 def filter_episodes(
     source: Dataset,
     *,
+    without: Collection[int] = (),
     success: bool | None = None,
     min_return: float | None = None,
     max_return: float | None = None,
@@ -116,14 +101,20 @@ def filter_episodes(
     name: str | None = None,
     out: Path | None = None,
 ) -> Path:
-    """Write the episodes of `source` that meet all conditions; bounds are inclusive, what is unknown meets none."""
+    """Write the episodes of `source`, without some uids, that meet all conditions.
+
+    Bounds are inclusive, and what is unknown meets none.
+    """
+    check_uids(source, without)
     given = {"success": success, "min_return": min_return, "max_return": max_return}
     config = only_given(**given, min_length=min_length, max_length=max_length)
+    config |= {"without": sorted(set(without))} if without else {}
     if np.isnan([bound for bound in (min_return, max_return) if bound is not None]).any():
         raise BadInputError("a filter's bounds on the return: expected numbers, got nan")
     if not config:
         raise BadInputError("a filter needs a condition: on success, return or length, or uids to leave out")
-    kept, uids = set(source.uids.tolist()), source.uids.tolist()
+    uids = source.uids.tolist()
+    kept = set(uids) - set(without)
     bounds = {"success": (success, success), "return": (min_return, max_return), "length": (min_length, max_length)}
     for key, (low, high) in bounds.items():
         if (low, high) != (None, None):
@@ -196,28 +187,11 @@ def _facts(source: Dataset, key: str) -> Sequence[Scalar | None]:
         return [int(length) for length in source.lengths]
     if key == "success" and (successes := source.successes()) is not None:
         return successes
-    if key not in source.metadata:
-        if key == "return" and REWARD in source.features:
-            return [outcome_of(episode.columns)[key] for episode in source.episodes([REWARD])]
-        if key in ("success", "return"):
-            raise BadInputError(f"the episodes of {source.reference} have no {key!r}: run `astra-data label --task`")
-        known = ["length", *source.metadata]
-        raise BadInputError(f"the episodes of {source.reference} have no {key!r}{did_you_mean(key, known)}")
-    return source.metadata[key]
-
-
-def _stratified(source: Dataset, key: str, seed: int) -> tuple[list[int], dict[str, int]]:
-    """Order the uids so that every prefix has its share of each stratum; return the episodes per stratum, too."""
-    # A subset stratified likewise hands on its own counts, not its rounded shares.
-    stratum = dict(zip(source.uids.tolist(), map(str, _facts(source, key)), strict=True))
-    strata, config = dict(sorted(Counter(stratum.values()).items())), source.description["config"]
-    if (config.get("stratify"), config.get("seed")) == (key, seed):
-        strata = dict(config["strata"])
-    place, ranks = dict[int, float](), dict.fromkeys(strata, 0)
-    for uid in permutation(stratum, seed):
-        place[uid] = (ranks[stratum[uid]] + 0.5) / strata[stratum[uid]]
-        ranks[stratum[uid]] += 1
-    return sorted(place, key=lambda uid: place[uid]), strata
+    if key in source.metadata:
+        return source.metadata[key]
+    if key == "return" and REWARD in source.features:
+        return [outcome_of(episode.columns)[key] for episode in source.episodes([REWARD])]
+    raise BadInputError(f"the episodes of {source.reference} have no {key!r}: run `astra-data label --task`")
 
 
 def _merged_uids(sources: Sequence[Dataset], new_uids: bool) -> list[dict[int, int]]:

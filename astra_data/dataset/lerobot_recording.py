@@ -23,7 +23,6 @@ from astra_data.dataset.description import ContentHash, Digests, complete_descri
 from astra_data.dataset.format import DEFAULT_COLUMNS, INFO_PATH, reserved_values
 from astra_data.dataset.parquet import UNREADABLE, open_parquet, read_blocks
 from astra_data.dataset.plain import MOST_FPS, PlainColumn, Run, data_files, plain_columns
-from astra_data.dataset.statistics import Roundings
 
 RECORDED_TASK = "recorded.task_index"  # (T,) int64: LeRobot's task_index, where there are several tasks
 ENDS = (names.TERMINATED, names.TRUNCATED)
@@ -224,14 +223,13 @@ def open_recording(root: Path) -> dict[str, Any]:
         )
     rows = Rows({column.name: column for column in stored}, fps)
     columns = our_columns(specs, has_tasks=len(tasks) > 1)
-    roundings = Roundings(columns, {column.name: column.dtype for column in stored})
-    episodes, content_hash, digests = _survey(root, rows, columns, tasks, info, roundings)
+    episodes, content_hash, digests = _survey(root, rows, columns, tasks, info)
     kept = [episode for episode in episodes if episode.steps]
     if not kept:
         raise BadInputError(f"{root}, recorded by LeRobot, has no episode of two rows or more")
     cameras, unread = read_cameras(root, info)
     others = sorted(info["features"].keys() - {*(spec.name for spec in specs), *names.RESERVED, *cameras, *unread})
-    _announce(root, rows, columns, episodes, others, roundings.found(), unread)
+    _announce(root, rows, columns, episodes, others, unread)
     uids, lengths = [episode.uid for episode in kept], np.array([episode.steps for episode in kept])
     positions = {uid: index for index, uid in enumerate(uids)}
     described = {"codebase_version": layout.CODEBASE_VERSION}
@@ -270,9 +268,8 @@ def _survey(
     columns: list[Column],
     tasks: Mapping[int, str],
     info: Mapping[str, Any],
-    roundings: Roundings,
 ) -> tuple[list[Found], str, Digests]:
-    """Read every value once, for `roundings`, too; return all episodes, hash and digests of what is ours."""
+    """Read every value once; return all episodes, hash and digests of what is ours."""
     stored, specs = list(rows.stored.values()), layout.stored_columns(columns)
     found: list[Found] = []
     faults: list[str] = []
@@ -291,8 +288,6 @@ def _survey(
         row += len(run)
         if not episode.steps:
             continue
-        if not faults:
-            roundings.add(run.columns)
         for name, values in rows.values(specs, run, kept, steps, uid).items():
             content.update(name, values)
             digests[name].append(digest_of(values))
@@ -359,11 +354,10 @@ def _announce(
     columns: Sequence[Column],
     episodes: Sequence[Found],
     others: Sequence[str],
-    rounded: Sequence[str],
     unread: Mapping[str, str],
 ) -> None:
     """Say in one line what is left out or rounded, and which ends are not those of episodes."""
-    parts = [*left_out(rows, episodes), *rounded]
+    parts = left_out(rows, episodes)
     if early := [episode.uid for episode in episodes if episode.is_done_early]:
         parts.append(
             f"{names.DONE} is set before the last row of {len(early)} episodes ({first_few(early, MOST_FAULTS)}), "

@@ -218,27 +218,3 @@ class Rounding:
         if lost and helps:
             advice += ', leave out what is a time, or store counts with dtype = "int64"'
         return f"columns.{self._column.name}: float32 holds {'; '.join(coarse)}: {advice}", lost
-
-
-class Roundings:
-    """Compares the steps of columns that were recorded as more than float32 holds."""
-
-    def __init__(self, columns: Iterable[Column], dtypes: Mapping[str, str]) -> None:
-        """Compare those of `columns`, recorded as `dtypes`."""
-        self._of = {
-            column.name: Rounding(column)
-            for column in columns
-            if column.dtype == "float32" and not np.can_cast(dtypes.get(column.name, "float32"), np.float32)
-        }
-
-    def add(self, columns: Mapping[str, Array]) -> None:
-        """Look at the rows (T,) or (T, size) of an episode, all finite."""
-        for name, rounding in self._of.items():
-            rows = as_rows(columns[name])
-            with np.errstate(over="ignore", invalid="ignore"):
-                rounding.add(rows, rows.astype(np.float32))
-
-    def found(self) -> list[str]:
-        """Return a warning for each column whose steps are held badly."""
-        found = [each for rounding in self._of.values() if (each := rounding.found())]
-        return [f"{warning} in a mapping for an import of the data files" for warning, _ in found]

@@ -15,7 +15,7 @@ from astra_data.cli import app as cli
 from astra_data.cli.arguments import show_table
 from astra_data.core.errors import AstraDataError, BadInputError
 from astra_data.dataset.columns import Episode
-from astra_data.dataset.edit import delete, subset
+from astra_data.dataset.edit import filter_episodes, subset
 from astra_data.dataset.versions import open_dataset, versions_at_home
 
 
@@ -27,7 +27,7 @@ def fake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
 
 
 def test_every_edit_is_the_next_version_at_home(fake: str, tmp_path: Path) -> None:
-    assert "(fake@data-1.1.0, 2 episodes, " in output_of("subset", fake, "--percent", "40", "--stratify", "success")
+    assert "(fake@data-1.1.0, 2 episodes, " in output_of("subset", fake, "--percent", "40")
     assert "(fake@data-1.2.0, 3 episodes, " in output_of("filter", fake, "--without", "13", "--without", "0")
     assert "(fake@data-1.3.0, 2 episodes, " in output_of("filter", fake, "--success")
     assert "(fake@data-1.4.0, 3 episodes, " in output_of("filter", fake, "--no-success")
@@ -217,7 +217,7 @@ def test_validate_and_repair(
 
 def test_lineage_and_differences_are_shown(tmp_path: Path) -> None:
     first = write_fake(tmp_path / "first")
-    made = delete(first, [13], out=tmp_path / "made")
+    made = filter_episodes(first, without=[13], out=tmp_path / "made")
     assert output_of("log", str(made)).splitlines()[1].startswith("└── fake@data-1.0.0  ")
     told = output_of("log", str(first.root), str(made)).splitlines()
     assert told[:3] == [
@@ -225,7 +225,7 @@ def test_lineage_and_differences_are_shown(tmp_path: Path) -> None:
         "fake@data-1.1.0: 4 episodes, 48 steps",
         "1 episodes only in fake@data-1.0.0: 13",
     ]
-    assert "stage: 'collect', then 'delete'" in told
+    assert "stage: 'collect', then 'filter'" in told
     back = output_of("log", str(made), str(first.root)).splitlines()
     assert back[2] == "1 episodes only in fake@data-1.0.0: 13"
 

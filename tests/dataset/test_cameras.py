@@ -17,7 +17,7 @@ from astra_data.dataset.cameras import ClipWriter, clip_fault, decoded, pooled
 from astra_data.dataset.columns import Clip
 from astra_data.dataset.doctor.check import check
 from astra_data.dataset.doctor.repair import repair
-from astra_data.dataset.edit import delete, merge, subset
+from astra_data.dataset.edit import filter_episodes, merge, subset
 from astra_data.dataset.frames import Frames
 from astra_data.dataset.inspection import inspect_dataset
 from astra_data.dataset.reader import Dataset
@@ -109,7 +109,8 @@ def test_a_written_camera_shows_the_frames_that_it_was_given(source: Dataset) ->
 def test_edits_keep_the_pictures_of_the_steps_that_are_left(source: Dataset, tmp_path: Path) -> None:
     half = subset(source, episodes=2, out=tmp_path / "subset")
     assert_shows(half, source, {uid: ALL[uid] for uid in Dataset.open(half).uids.tolist()})
-    assert_shows(delete(source, [8], out=tmp_path / "delete"), source, {uid: ALL[uid] for uid in (3, 5)})
+    left = filter_episodes(source, without=[8], out=tmp_path / "filter")
+    assert_shows(left, source, {uid: ALL[uid] for uid in (3, 5)})
     ends = slice(3, -2)
     trimmed = trim(source, start_s=0.15, end_s=0.1, out=tmp_path / "trim")
     assert_shows(trimmed, source, {uid: (uid, ends) for uid in LENGTHS})

@@ -15,7 +15,7 @@ from astra_data.dataset.compare import (
     names_apart,
     tree_lines,
 )
-from astra_data.dataset.edit import delete, merge, subset
+from astra_data.dataset.edit import filter_episodes, merge, subset
 
 
 def test_equal_datasets_do_not_differ(tmp_path: Path) -> None:
@@ -70,16 +70,16 @@ pytestmark = pytest.mark.usefixtures("home")
 
 def test_ancestors_are_found_at_home_and_beside(tmp_path: Path) -> None:
     first = write_fake(tmp_path / "home/fake/data-1.0.0")
-    left = Dataset.open(delete(first, [13], out=tmp_path / "left"))
+    left = Dataset.open(filter_episodes(first, without=[13], out=tmp_path / "left"))
     right = Dataset.open(subset(left, episodes=2, seed=4, out=tmp_path / "right"))
     both = Dataset.open(merge([left, right], new_uids=True, out=tmp_path / "both"))
     prints = [dataset.content_hash[:8] for dataset in (both, left, first, right)]
     assert list(tree_lines(lineage(both))) == [
         f"fake@data-1.2.0  {prints[0]}  merge: datasets ['fake@data-1.1.0', 'fake@data-1.2.0'], new_uids True",
-        f"├── fake@data-1.1.0  {prints[1]}  delete: episodes [13]",
+        f"├── fake@data-1.1.0  {prints[1]}  filter: without [13]",
         f"│   └── fake@data-1.0.0  {prints[2]}  collect: episodes 5, noise_m 0.1",
         f"└── fake@data-1.2.0  {prints[3]}  subset: episodes 2, seed 4",
-        f"    └── fake@data-1.1.0  {prints[1]}  delete: episodes [13]  (its parents: see above)",
+        f"    └── fake@data-1.1.0  {prints[1]}  filter: without [13]  (its parents: see above)",
     ]
 
 
@@ -87,7 +87,7 @@ def test_ancestors_are_found_at_home_and_beside(tmp_path: Path) -> None:
 def test_ancestors_are_found_in_the_run(tmp_path: Path, place: str) -> None:
     """In the folders of its other stages, wherever there is a run."""
     first = write_fake(tmp_path / "run/label/seed_0")
-    made = Dataset.open(delete(first, [13], out=tmp_path / "run" / place))
+    made = Dataset.open(filter_episodes(first, without=[13], out=tmp_path / "run" / place))
     found = f"└── fake@data-1.0.0  {first.content_hash[:8]}  "
     assert list(tree_lines(lineage(made)))[1:] == [f"{found}(not found here)"]
     (tmp_path / "run/recipe.json").write_text("{}")
@@ -96,8 +96,8 @@ def test_ancestors_are_found_in_the_run(tmp_path: Path, place: str) -> None:
 
 def test_an_ancestor_is_known_by_its_hash(tmp_path: Path) -> None:
     first = write_fake(tmp_path / "elsewhere/first")
-    made = Dataset.open(delete(first, [13, 4], out=tmp_path / "made"))
-    delete(made, [0], out=tmp_path / "home/fake/data-1.0.0")
+    made = Dataset.open(filter_episodes(first, without=[13, 4], out=tmp_path / "made"))
+    filter_episodes(made, without=[0], out=tmp_path / "home/fake/data-1.0.0")
     [line] = list(tree_lines(lineage(made)))[1:]
     assert line == f"└── fake@data-1.0.0  {first.content_hash[:8]}  (not found here)"
 

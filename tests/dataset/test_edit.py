@@ -8,7 +8,7 @@ from fake_dataset import COLUMNS, DESCRIPTION, assert_same, fake_episode, write_
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import REWARD, STATE, Column, Episode
-from astra_data.dataset.edit import delete, filter_episodes, merge, share, subset
+from astra_data.dataset.edit import filter_episodes, merge, share, subset
 from astra_data.dataset.reader import Dataset
 
 
@@ -57,25 +57,6 @@ def test_a_subset_of_a_subset_is_the_subset(forty: Dataset, tmp_path: Path) -> N
     assert uids(tmp_path / "a") != uids(subset(forty, episodes=7, out=tmp_path / "c"))
 
 
-@pytest.mark.parametrize("count", [1, 30])
-def test_a_stratified_subset_keeps_shares_and_nesting(tmp_path: Path, count: int) -> None:
-    with writer(tmp_path / "set") as open_writer:
-        for uid in (*range(0, 52, 2), *range(1, 19, 2)):
-            open_writer.add(fake_episode(uid, 3))
-    whole = Dataset.open(tmp_path / "set")
-    assert whole.metadata["success"].count(True) == 9
-    made = Dataset.open(subset(whole, episodes=count, stratify="success", out=tmp_path / "part"))
-    other = Dataset.open(subset(whole, episodes=count, stratify="success", seed=1, out=tmp_path / "other"))
-    assert uids(other.root) != uids(made.root)
-    for one in (made, other):
-        assert abs(sum(map(bool, one.metadata["success"])) - count * 9 / 35) <= 0.5
-    for fewer in range(1, count, 9):
-        direct = subset(whole, episodes=fewer, stratify="success", out=tmp_path / f"direct{fewer}")
-        stepwise = subset(made, episodes=fewer, stratify="success", out=tmp_path / f"step{fewer}")
-        assert uids(direct) == uids(stepwise) < uids(made.root)
-        assert Dataset.open(stepwise).description["config"]["strata"] == {"False": 26, "True": 9}
-
-
 def test_copies_of_a_recording_go_together(tmp_path: Path) -> None:
     with writer(tmp_path / "copies") as open_writer:
         for uid in range(60):  # ten recordings, of each of which there are five copies
@@ -102,8 +83,6 @@ def test_percent_is_of_a_given_number_and_nothing_is_repeated(forty: Dataset, tm
         subset(forty, percent=150, out=tmp_path / "too-many")
     with pytest.raises(BadInputError, match="the subset has 0 episodes"):
         subset(forty, episodes=0, out=tmp_path / "none")
-    with pytest.raises(BadInputError, match=r"have no 'sucess': did you mean 'success'"):
-        subset(forty, episodes=3, stratify="sucess", out=tmp_path / "typo")
     with pytest.raises(BadInputError, match="either a number of episodes or a percentage"):
         subset(forty, episodes=3, percent=3, out=tmp_path / "both")
     with pytest.raises(BadInputError, match=r"a percentage \(optionally with --of\)"):
@@ -115,20 +94,20 @@ def test_percent_is_of_a_given_number_and_nothing_is_repeated(forty: Dataset, tm
     assert [path.name for path in tmp_path.iterdir()] == ["more"]
 
 
-def test_delete_leaves_the_others(forty: Dataset, tmp_path: Path) -> None:
-    folder = delete(forty, [39, 3, 39], out=tmp_path / "set")
+def test_a_filter_without_episodes_leaves_the_others(forty: Dataset, tmp_path: Path) -> None:
+    folder = filter_episodes(forty, without=[39, 3, 39], out=tmp_path / "set")
     assert uids(folder) == set(range(40)) - {3, 39}
     assert_taken_over(forty, folder)
-    assert Dataset.open(folder).description["config"] == {"episodes": [3, 39]}
+    assert Dataset.open(folder).description["config"] == {"without": [3, 39]}
 
 
-def test_an_unknown_episode_deletes_nothing(forty: Dataset, tmp_path: Path) -> None:
+def test_a_filter_without_an_unknown_episode_writes_nothing(forty: Dataset, tmp_path: Path) -> None:
     with pytest.raises(
         BadInputError, match=r"no episode 40, 99; its 40 uids lie between 0 and 39: 0, 1, .* and 32 more"
     ):
-        delete(forty, [3, 99, 40], out=tmp_path / "set")
+        filter_episodes(forty, without=[3, 99, 40], out=tmp_path / "set")
     with pytest.raises(BadInputError, match=r"none of its \d+ episodes would be left"):
-        delete(forty, list(range(40)), out=tmp_path / "set")
+        filter_episodes(forty, without=list(range(40)), out=tmp_path / "set")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -142,8 +121,8 @@ def test_filters_meet_every_condition(forty: Dataset, tmp_path: Path) -> None:
         "max_return": 9.5,
         "max_length": 4,
     }
-    failed = filter_episodes(forty, success=False, min_length=6, out=tmp_path / "failed")
-    assert uids(failed) == {4, 14, 24, 34}
+    failed = filter_episodes(forty, without=[5, 14], success=False, min_length=6, out=tmp_path / "failed")
+    assert uids(failed) == {4, 24, 34}
 
 
 def test_filters_that_cannot_work_are_refused(forty: Dataset, tmp_path: Path) -> None:
@@ -248,6 +227,6 @@ def test_datasets_of_different_tasks_are_merged(tmp_path: Path) -> None:
     assert (two.task, two.metadata["task"]) == ("walk / run", ["walk", "run", "run"])
     more = Dataset.open(merge([two, parts[3]], out=tmp_path / "more"))
     assert (more.task, more.metadata["task"]) == ("walk / run / stand", ["walk", "run", "run", "stand"])
-    part = Dataset.open(delete(more, [1], out=tmp_path / "part"))
+    part = Dataset.open(filter_episodes(more, without=[1], out=tmp_path / "part"))
     both = Dataset.open(merge([parts[1], part], out=tmp_path / "both"))
     assert (both.task, both.metadata["task"]) == ("walk / run / stand", ["walk", "run", "run", "stand"])

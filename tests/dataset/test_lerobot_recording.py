@@ -6,11 +6,8 @@ import shutil
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 from damaged import DATA, alter_rows
-from fake_dataset import write_fake
 from lerobot_recordings import JOINTS, values
 from typer.testing import CliRunner
 
@@ -64,24 +61,6 @@ def test_what_is_left_out_is_said_in_one_line(recorded: Path, caplog: pytest.Log
     reward = sum(float(values("arm", number)[keys.REWARD][-1]) for number in range(4))
     assert f"with the last rows a reward of {reward:g} in sum is left out" in line
     assert line.count(" here, recorded as ") == 1 and line.endswith("; force is float32 here, recorded as float64")
-
-
-def test_steps_that_float32_rounds_are_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """Of columns of float64, such as northings in m."""
-    root = write_fake(tmp_path / "utm").root
-    shutil.rmtree(root / "meta/astra")
-    for first, told in ((4_429_530.0, True), (0.0, False)):
-        table = pq.read_table(root / DATA)
-        rows = [[0.1 * row, first + 0.63 * row, 0.0] for row in range(len(table))]
-        at = table.column_names.index(keys.STATE)
-        pq.write_table(table.set_column(at, keys.STATE, pa.array(rows, pa.list_(pa.float64()))), root / DATA)
-        info = json.loads((root / "meta/info.json").read_text())
-        info["features"][keys.STATE]["dtype"] = "float64"
-        (root / "meta/info.json").write_text(json.dumps(info))
-        caplog.clear()
-        Dataset.open(root)
-        for said in (caplog.messages[0], "; ".join(repair(root, out=tmp_path / f"whole{first}").notes)):
-            assert ("float32 holds y (up to 4.42956e+06) in steps of 0.5, but it moves by 0.63" in said) == told
 
 
 def test_repaired_it_is_as_it_was_opened(arm: Dataset, recorded: Path, tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from damaged import reseal
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset import columns as keys
-from astra_data.dataset.edit import delete
+from astra_data.dataset.edit import filter_episodes
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.writer import DatasetWriter
 from astra_data.grounding.paired_episodes import PairedEpisodes, draw_steps
@@ -84,7 +84,7 @@ def test_where_no_step_is_one_of_the_robot_there_is_nothing_to_load(
     monkeypatch.setitem(globals(), "LENGTHS", (1, 1, 1, 1))
     whole = write(tmp_path / "pairs", SIZES | {keys.NEXT_STATE: 3}, made_up=True)
     assert PairedEpisodes.load(whole).lengths.tolist() == [1, 1]
-    ended = delete(Dataset.open(whole), [0, 1], out=tmp_path / "ended")
+    ended = filter_episodes(Dataset.open(whole), without=[0, 1], out=tmp_path / "ended")
     with pytest.raises(BadInputError, match="no step is left: each episode has a single one, whose"):
         PairedEpisodes.load(ended)
 

@@ -13,7 +13,7 @@ from quick_runs import small_tables
 
 from astra_data.core.progress import silent
 from astra_data.dataset.columns import GOAL, REWARD
-from astra_data.dataset.edit import delete, subset
+from astra_data.dataset.edit import filter_episodes, subset
 from astra_data.dataset.reader import Dataset
 from astra_data.io.importing import import_dataset
 from astra_data.pipeline.experiment import condition, load_experiment
@@ -118,7 +118,7 @@ def test_other_data_of_the_same_name_are_labeled_anew(cart: Path, tmp_path: Path
     link = experiment.folder / "label/seed_0"
     older = shutil.copytree(whole, tmp_path / "older")
     shutil.rmtree(whole)
-    delete(Dataset.open(older), Dataset.open(older).uids[:1].tolist(), out=whole)
+    filter_episodes(Dataset.open(older), without=Dataset.open(older).uids[:1].tolist(), out=whole)
     link.unlink()
     link.symlink_to(older)
     assert condition(item, experiment).is_finished

@@ -19,7 +19,6 @@ from astra_data.dataset.description import Digests, altered_files, read_descript
 from astra_data.dataset.doctor.salvage import whole_runs
 from astra_data.dataset.plain import PlainColumn, Run, is_format_2, read_object, read_small_table, read_tasks
 from astra_data.dataset.reader import Dataset, refuse_run, refuse_versions
-from astra_data.dataset.statistics import Roundings
 from astra_data.dataset.versions import successor
 from astra_data.dataset.writer import DatasetWriter
 
@@ -73,7 +72,6 @@ def repair(
         renamed = sum("merged_uid" in episode.metadata for episode in joined)
         notes += [f"{renamed} episodes have new uids, because theirs were taken"] if renamed else []
     unknown = 0
-    roundings = Roundings(remains.specs, {column.name: column.dtype for column in remains.columns})
     recorded: list[lerobot.Found] = []
     theirs = {uid for source in sources for uid in source.uids.tolist()}
     task = " / ".join(str(tasks[index]) for index in sorted(tasks)) or "unknown"
@@ -106,7 +104,6 @@ def repair(
                     raise BadInputError("; ".join(unseen))
                 episode = Episode(known.uid, values, known.metadata, clips)
                 writer.add(episode)
-                roundings.add(run.columns)
             except BadInputError as error:
                 notes.append(f"left out the episode of uid {uid}: {error}")
                 continue
@@ -115,7 +112,7 @@ def repair(
             result.frames += len(episode)
         if rows and recorded:
             notes.append("; ".join(lerobot.left_out(rows, recorded)))
-        notes += [*roundings.found(), *remains.losses(result.episodes, writer.content_hash)]
+        notes += remains.losses(result.episodes, writer.content_hash)
         if (remains.metadata or sources) and unknown:
             notes.append(f"{unknown} episodes have no metadata: they are not among the known ones")
         if len(tasks) > 1:

@@ -14,7 +14,7 @@ from astra_data.cli.sharing import export as export_card
 from astra_data.core.errors import CorruptDatasetError
 from astra_data.core.progress import silent
 from astra_data.dataset.compare import differences
-from astra_data.dataset.edit import delete, filter_episodes, merge, subset
+from astra_data.dataset.edit import filter_episodes, merge, subset
 from astra_data.dataset.inspection import inspect_dataset
 from astra_data.dataset.reader import Dataset
 from astra_data.io.exporters import export
@@ -33,7 +33,6 @@ def opened(root: Path) -> Dataset:
 COMMANDS: dict[str, Command] = {
     "subset": lambda root, out: subset(opened(root), percent=100, out=out),
     "merge": lambda root, out: merge([opened(root), opened(root)], new_uids=True, out=out),
-    "delete": lambda root, out: delete(opened(root), [int(opened(root).uids[-1])], out=out),
     "filter": lambda root, out: filter_episodes(opened(root), min_length=1, out=out),
     "augment": lambda root, out: augment(
         TASK, AugmentConfig(episodes=10), dataset=root, seed=0, out=out, progress=silent
