@@ -79,6 +79,13 @@ def resumed(checkpoint: Path) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]
         raise BadInputError(f"{checkpoint}: {expected}: remove {checkpoint.parent}") from error
 
 
+def not_finite(tensors: Mapping[str, Tensor]) -> str:
+    """Say which weights are not finite; an infinite deviation is how networks leave out a part of their input."""
+    wrong = {name: one.isnan() if name.endswith("_std") else ~one.isfinite() for name, one in tensors.items()}
+    named = [name for name, where in wrong.items() if where.any()]
+    return f"NaN or infinity in {first_few(named, 3)}" if named else ""
+
+
 @contextmanager
 def understood(
     path: Path, what: str, kinds: Collection[str], device: str
@@ -89,11 +96,8 @@ def understood(
     if kind not in kinds:
         found = "a file without a kind" if kind is None else f"kind {kind}"
         raise BadInputError(f"{path}: expected {what} (kind {' or '.join(kinds)}), found {found}: run that stage again")
-    # An infinite deviation is how networks leave out a part of their input.
-    wrong = {name: one.isnan() if name.endswith("_std") else ~one.isfinite() for name, one in tensors.items()}
-    if any_wrong := [name for name, where in wrong.items() if where.any()]:
-        found = f"found NaN or infinity in {first_few(any_wrong, 3)}"
-        raise BadInputError(f"{path}: expected finite weights, {found}: run that stage again")
+    if wrong := not_finite(tensors):
+        raise BadInputError(f"{path}: expected finite weights, found {wrong}: run that stage again")
     moved = {name: tensor.to(device) for name, tensor in tensors.items()}
     try:
         yield moved, metadata

@@ -15,7 +15,7 @@ from astra_data.core.config import did_you_mean
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import first_few
 from astra_data.dataset import columns as names
-from astra_data.dataset.checkup import SHOWN, TURNS
+from astra_data.dataset.checkup import SHOWN, TURNS, is_clock
 from astra_data.dataset.columns import Array, Column, Episode, new_uid
 from astra_data.dataset.inspection import outcome_of
 from astra_data.dataset.reader import Dataset
@@ -184,7 +184,9 @@ def _resampled(episode: Episode, schema: Sequence[Column], before: int, fps: int
         elif column.name in (names.TERMINATED, names.TRUNCATED, names.DONE, names.SUCCESS):
             counts = np.concatenate([[0], np.cumsum(values)])
             found = np.diff(counts[[*row[:-1], len(episode)]]) > 0
-        elif column.dtype == "float32" and _OBSERVED.match(column.name) and column.name != names.GOAL:
+        elif is_clock(column) or (
+            column.dtype == "float32" and _OBSERVED.match(column.name) and column.name != names.GOAL
+        ):
             of = episode.columns[names.STATE] if column.name == names.NEXT_STATE else values
             if has_next and column.name in (names.STATE, names.NEXT_STATE):
                 of = np.concatenate([of, episode.columns[names.NEXT_STATE][-1:]])

@@ -82,7 +82,10 @@ def refuse_far(state: Any, about: dict[str, Any]) -> None:  # noqa: ANN401 - an 
 
 def finite(called: str, given: Any, names: Sequence[str]) -> Any:  # noqa: ANN401 - anything like an array
     """Return what was `given` as an array of float32, or raise a ValueError if it is not one value a name."""
-    values = np.asarray(given, np.float32)
+    try:
+        values = np.asarray(given, np.float32)
+    except (TypeError, ValueError):  # texts, rows of several lengths
+        values = np.full(len(names), np.nan)
     if values.shape != (len(names),) or not np.isfinite(values).all():
         raise ValueError(f"{called}: expected {len(names)} finite values {names}, got {given!r}")
     return values

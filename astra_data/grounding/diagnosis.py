@@ -15,7 +15,6 @@ from astra_data.dataset.checkup import Finding
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import open_dataset
 from astra_data.robots.registry import Pairing, built, pairing_named
-from astra_data.worlds.commands import Commands
 from astra_data.worlds.protocols import AbstractSimulator
 
 LONGEST_S, LONGEST_STEPS = 2.0, 20  # longest delay that is looked for: the shorter of the two
@@ -100,7 +99,8 @@ def diagnose(dataset: str | Path, simulator: str, progress: Progress = silent) -
     log = _Log.of(source)
     labels = {column.name: column.labels for column in source.schema}
     names = labels[keys.ACTION]
-    commands = _commands(log, names, pairing.commands)
+    usual = [(-1.0, 1.0)] * len(names) if pairing.columns else []  # of a task, ±1
+    commands = _commands(log, names, [*pairing.commands.values()] if pairing.commands else usual)
     felt = _Felt.of(log, pairing, source.info["fps"], progress)
     responses = _responses(log, felt, names, source.info["fps"])
     missed = _missed(log, pairing)
@@ -471,11 +471,13 @@ def _of_hidden_state(explained: Sequence[Floats], shown: Sequence[str]) -> Itera
         yield Finding("note", f"the robot's whole recorded state explains {recorded[0]:.2f} of it", advice)
 
 
-def _commands(log: _Log, names: Sequence[str], bounds: Commands | None) -> dict[str, tuple[float, float, float, float]]:
+def _commands(
+    log: _Log, names: Sequence[str], bounds: Sequence[tuple[float, float]]
+) -> dict[str, tuple[float, float, float, float]]:
     """Return the 1 and 99 % quantiles of each command, and its bounds, by default the recorded ones."""
     given = np.quantile(log.action, [0.01, 0.99, 0.0, 1.0], axis=0).T
     if bounds:
-        given[:, 2:] = [*bounds.values()]
+        given[:, 2:] = bounds
     return {name: tuple(row) for name, row in zip(names, given.tolist(), strict=True)}
 
 

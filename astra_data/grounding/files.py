@@ -5,9 +5,10 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from astra_data.core.checkpoint import loaded, save_tensors, understood
+from astra_data.core.checkpoint import loaded, not_finite, save_tensors, understood
 from astra_data.core.errors import BadInputError
 from astra_data.core.lazy import torch, without_gradients
+from astra_data.grounding.descent import seeded
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.simulator import NO_GROUNDING, FittedGrounding, Grounding
 from astra_data.worlds.task import Task
@@ -34,6 +35,8 @@ def kinds() -> dict[str, type[FittedGrounding]]:
 def save_grounding(path: Path, grounding: FittedGrounding, episodes: PairedEpisodes) -> None:
     """Write `grounding`, which was fitted to `episodes`, to `path`."""
     tensors, metadata = parts_of(grounding)
+    if wrong := not_finite(tensors):
+        raise BadInputError(f"fit returned a {type(grounding).__name__} with {wrong}: expected finite values")
     save_tensors(path, tensors, episodes.named | {"kind": grounding.kind} | metadata)
 
 
@@ -105,15 +108,18 @@ def fitted(returned: object) -> tuple[FittedGrounding, dict[str, Any]]:
 
 
 @without_gradients
-def check_step(task: Task, grounding: FittedGrounding, episodes: PairedEpisodes) -> None:
-    """Step the corrected simulator of `task` once, from where the first of `episodes` begin."""
+def check_step(task: Task, fit: FittedGrounding, written: FittedGrounding, episodes: PairedEpisodes) -> None:
+    """Step the simulator of `task` once, as corrected by what was `fit` and `written`, where `episodes` begin."""
     windows = episodes.windows
     state, goal, action = (values[:2, 0] for values in (windows.state, windows.goal, windows.action))
-    with explained(f"a step of {task.name} as corrected by {type(grounding).__name__}"):
-        simulator = grounding.simulator(task, len(state), str(state.device))
-        simulator.start(state, torch.arange(len(state), device=state.device), goal)
-        landed: object = simulator.step(action)
-        reached = simulator.state
+    landings = []
+    for grounding in (fit, written):
+        with explained(f"a step of {task.name} as corrected by {type(grounding).__name__}"), seeded(0, state.device):
+            simulator = grounding.simulator(task, len(state), str(state.device))
+            simulator.start(state, torch.arange(len(state), device=state.device), goal)
+            landed: object = simulator.step(action)
+            reached = simulator.state
+            landings.append(reached.clone())
     got = tuple(landed.shape) if isinstance(landed, torch.Tensor) else f"a {type(landed).__name__}"
     if not isinstance(landed, torch.Tensor) or landed.shape != state.shape:
         raise BadInputError(
@@ -125,6 +131,13 @@ def check_step(task: Task, grounding: FittedGrounding, episodes: PairedEpisodes)
             f"{type(simulator).__name__}.step: returned states up to {apart} from its simulator's, which "
             "would go on uncorrected: expected `return self._settle(before, corrected)`, which moves the "
             "simulator to the corrected states, as far as walls allow"
+        )
+    first, second = landings
+    if not torch.allclose(first, second, rtol=_ROUNDING, atol=_ROUNDING, equal_nan=True):
+        apart = f"{(first - second).abs().max():.3g}"
+        raise BadInputError(
+            f"{type(fit).__name__}.from_file: steps of what it returns end up to {apart} from those of what fit "
+            "returned: expected what to_file wrote"
         )
 
 

@@ -123,7 +123,7 @@ class HistoryFit:
             failures, metrics["failure_model"] = fit_failures(task, grounding, training, fitting.seed)
             metrics["failures"] = {"failure_model": failure_figures(task, grounding, failures, held_out)}
             grounding = replace(grounding, failures=failures)
-        return grounding, metrics
+        return grounding, metrics | metrics.pop("stopwatch").spent()
 
     def _fitted(self, fitting: Fitting, *, corrects_reward: bool) -> "tuple[GroundingModel, dict[str, Any]]":
         from astra_data.grounding.encoder import HistoryEncoder, take_scales
@@ -195,7 +195,7 @@ def _optimize(model: "GroundingModel", weights: "LossWeights", fitting: Fitting)
     descent.finish()
     return {
         "windows_per_second": descent.done * config.batch_windows / descent.stopwatch.seconds,
-        **descent.stopwatch.spent(),
+        "stopwatch": descent.stopwatch,
         "parameters": sum(parameter.numel() for parameter in descent.parameters),
         "window": window,
         "updates": descent.best,

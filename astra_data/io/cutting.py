@@ -282,6 +282,11 @@ class Cutter:
                 advice.append(first_few(named, _SHOWN))
             given = f"'{time}' gives {steps / seconds:.4g} rows per second, but fps is {fps}"
             raise BadInputError(f"{given}: {'; '.join(advice)}")
+        if 2 * tally.still_rows > steps:
+            still = f"'{time}' stands still in {tally.still_rows} of {tally.rows} rows, first in {tally.still_first}"
+            raise BadInputError(
+                f"{still}: expected one row at a time: remove copies, or split where another robot begins"
+            )
         tally.notes += [f"{name}, {fps} Hz declared" for name in named]
         tally.clock = str(self._clock)
 

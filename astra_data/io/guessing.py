@@ -113,7 +113,7 @@ class Logs:
     def recorded_rate(self) -> float:
         """Rows per second without gaps and repeated rows; `RATE_HZ` where the logs have no time."""
         steps = np.concatenate([_steps(self.episodes, field) for field in self.of("time")] or [np.array([1 / RATE_HZ])])
-        return 1 / float(steps[(steps > 0) & (steps <= 5 * np.median(steps))].mean())
+        return 1 / float(steps[(steps > 0) & (steps <= 1.5 * np.median(steps))].mean())
 
     @property
     def rate(self) -> int:
@@ -155,7 +155,7 @@ def guess(paths: Sequence[Path]) -> Logs:
         found = _field(name, [episode[name] for episode in raw])
         is_taken = found.role in ("state", "command") and found.taken_for in [one.taken_for for one in fields]
         fields.append(replace(found, short=plain_name(name)) if is_taken else found)
-    fields = _places(_roles(_times(fields, raw)), raw)
+    fields = _places(_roles(_times(first, fields, raw)), raw)
     for time in (field for field in fields if field.role == "time"):
         _check_rates(sources, [np.diff(table[time.name]) * time.scale for table in tables])
         raw = [part for one in raw for part in _cut(one, 1 + np.flatnonzero(np.diff(one[time.name]) < 0))]
@@ -233,7 +233,7 @@ def _field(name: str, series: Sequence[Floats]) -> Field:
         (not finite.size, "left out", "texts, dates or nothing: expected numbers, of a time in s, ms, us or ns"),
         (rises and falls, "time", "it goes back, where episodes begin (CHECK)"),
         (rises, "time", "its ending, and it never goes back" if time_unit else f"steps of {step:g}"),
-        (TIME.fullmatch(clock), "left out", "a time that does not rise"),
+        (TIME.fullmatch(clock), "left out", _FALLS),
         (UNCLEAR.fullmatch(plain), "left out", "an end, but which? name it success or failed"),
         (EPISODE.fullmatch(plain) and _is_whole(values), "episode", named),
         (COUNT.fullmatch(plain), "left out", named),
@@ -268,10 +268,20 @@ def _field(name: str, series: Sequence[Floats]) -> Field:
     return Field(name, role, short, unit, why=named if unit != "1" else "no unit in its name")
 
 
-def _times(fields: Sequence[Field], episodes: Sequence[dict[str, Floats]]) -> list[Field]:
+_FALLS = "a time that does not rise"
+
+
+def _times(place: Path, fields: Sequence[Field], episodes: Sequence[dict[str, Floats]]) -> list[Field]:
     """Return the fields with one time, that of the log: the others are times of topics."""
     rising = [f for f in fields if f.role == "time" and (_steps(episodes, f) > 0).mean() > MOSTLY]
     chosen = sorted(rising, key=lambda field: not TIME.fullmatch(_without_unit(field.short, TIMES)[0]))[:1]
+    for field in fields:
+        if not chosen and (field.role == "time" or field.why == _FALLS):
+            steps = np.concatenate([np.diff(one[field.name]) for one in episodes])
+            raise BadInputError(
+                f"{place}: {field.name}: expected a time that rises from row to row, got {(steps == 0).sum()} rows in "
+                f"which it stands still and {(steps < 0).sum()} in which it goes back: remove copies and sort the rows"
+            )
     why = f"a time beside {chosen[0].name}" if chosen else "a time that stands still in some rows"
     topics = [field for field in fields if field.role == "time" and field not in chosen]
     return [Field(field.name, "left out", field.short, why=why) if field in topics else field for field in fields]
@@ -340,6 +350,8 @@ def csv_files(place: Path) -> list[Path]:
     """Return the CSV files in a folder, or the one that `place` is; raise BadInputError if there is none."""
     inside = sorted(place.iterdir()) if place.is_dir() else [place]
     found = [path for path in inside if path.suffix.lower() in SUFFIXES]
+    if broken := [str(path) for path in found if path.is_symlink() and not path.exists()]:
+        raise BadInputError(f"{', '.join(broken)}: a link to nothing: remove it, or restore what it leads to")
     if not found:
         for refuse in (refuse_versions, refuse_dataset, refuse_run):
             refuse(place)

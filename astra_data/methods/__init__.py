@@ -1,6 +1,7 @@
 """All methods by name; each file defines one method, or a family of them. Those of the user's are added."""
 
 import re
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -62,7 +63,7 @@ def add_method(name: str, place: str) -> None:
     if faults := [*_faults(method)]:
         raise BadInputError("; ".join(f"{place} {fault}" for fault in faults))
     if (kind := method.grounding) and (owner := kinds().setdefault(kind.kind, kind)) is not kind:
-        whose = f"{owner.__name__} in {owner.__module__}"
+        whose = f"{owner.__name__} in {sys.modules[owner.__module__].__file__}"
         raise BadInputError(f"{place}: groundings of kind '{kind.kind}' are those of {whose}: rename its kind")
     if isinstance(method.fit, HistoryFit) and (encoder := method.fit.encoder):
         from astra_data.grounding.encoder import ENCODERS
@@ -80,7 +81,8 @@ def _faults(method: Method) -> Iterator[str]:
     if method.learn is None:
         yield "learns no policy: expected learn, an UserLearner that returns one"
     if method.grounding is not None and (missing := missing_parts(method.grounding)):
-        yield f"has a grounding, {method.grounding.__name__}, without {', '.join(missing)}"
+        lacks = f"has a grounding, {method.grounding.__name__}, without {', '.join(missing)}"
+        yield f"{lacks}: expected a subclass of FittedGrounding"
     if (table := method.table) is None:
         return
     if not issubclass(table.model, Config):

@@ -172,7 +172,11 @@ def first_simulator(logs: Logs) -> SimulatorKind:
             good = good if simulated[0] < along_axes else None  # two arms, or a base that is driven along x and y
     if not good:
         if not direct.entries:
-            raise BadInputError("found no state that a command could move: name it as its command, cmd_q1 and q1")
+            left_out = ", ".join(f"{one.name} ({one.why})" for one in logs.fields if one.role == "left out")
+            without = f"; left out: {left_out}" if left_out else ""
+            raise BadInputError(
+                f"found no state that a command could move: name it as its command, cmd_q1 and q1{without}"
+            )
         return direct
     rest = _direct(logs, good)
     merged = {name: getattr(good, name) + getattr(rest, name) for name in ("entries", "lines", "remarks")}

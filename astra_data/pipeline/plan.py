@@ -77,26 +77,28 @@ def plan(
     selection: Selection | None = None,
     *,
     device: str = "cpu",
+    reports: Selection | None = None,
     publish: Path | None = None,
     published: Sequence[Path] = (),
 ) -> tuple[Item, ...]:
-    """Return every artifact of the `recipe` at `path`, each after those it reads, seed after seed, and its report."""
-    selection = selection or Selection.of(recipe)
+    """Return every artifact of the `recipe` at `path`, each after those it reads, seed after seed, and its report.
+
+    A `selection` is made; what the report is of, `reports`, is by default all that is finished of the recipe.
+    """
+    selection, reports = selection or Selection.of(recipe), reports or Selection.of(recipe)
     items = list(_Plan(recipe, folder, selection, device).items())
     keys = tuple(selection.points())
-    rows, seeds, percents = selection.methods, selection.seeds, selection.percents
-    reported = Reported(
-        name=path.stem, task=recipe.task, methods=rows, seeds=seeds, percents=percents, settings=in_full(recipe)
-    )
+    about = {"name": path.stem, "task": recipe.task, "settings": in_full(recipe)}
+    chosen, reported = (Reported(**vars(part), **about) for part in (selection, reports))
     if recipe.select and len(selection.seeds) > 1:
-        of = benches(reported, judge_of(recipe.select.judge, recipe.methods))
+        of = benches(chosen, judge_of(recipe.select.judge, recipe.methods))
         if any(bench.entries for bench in of):  # there are policies to judge
             inputs = tuple(dict.fromkeys(key for bench in of for key in bench.keys))
-            call = partial(STAGES["select"].run, reported, recipe.select, root=folder)
+            call = partial(STAGES["select"].run, chosen, recipe.select, root=folder)
             settings = {"select": recipe.select.model_dump(mode="json")}
             items.append(Item("select", inputs, call, settings=settings))
             keys += ("select",)
-    command = _command(recipe, path, selection)
+    command = _command(recipe, path, reports)
     to: dict[str, Any] = {"root": folder, "command": command, "publish": publish, "published": published}
     return (*items, Item("report", keys, partial(STAGES["report"].run, reported, **to, config=recipe.report)))
 

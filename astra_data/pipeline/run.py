@@ -158,7 +158,9 @@ def run_stage(
         raise BadInputError(f"{recipe_path} uses the data {recipe.data}: there is nothing to collect")
     selection, results = Selection.of(recipe, methods, seeds), experiment.results if publish else None
     published = experiment.published() if publish else ()
-    planned = plan(recipe, recipe_path, folder, selection, device=device, publish=results, published=published)
+    planned = plan(
+        recipe, recipe_path, folder, selection, device=device, reports=selection, publish=results, published=published
+    )
     make(experiment, _selected(planned, stage, methods), planned, jobs=jobs, device=device)
     return folder / stage
 

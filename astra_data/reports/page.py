@@ -101,6 +101,9 @@ def _facts(results: Results) -> Iterator[Block]:
         for percent in results.percents
         if (lacking := [row for row in results.rows if row not in results.tested(percent)])
     ]
+    asked = results.settings.get("seeds")
+    if lacking := [f"{seed}" for seed in asked if seed not in results.seeds] if isinstance(asked, list) else []:
+        unfinished.append(f"seeds {', '.join(lacking)}")
     if unfinished:
         text += f" Not finished yet: {'; '.join(unfinished)}."
     yield Text(text)

@@ -84,7 +84,8 @@ def success_rate(success: Sequence[float], predicted: Sequence[float], mean: flo
 
     `predicted` (n,) are the trials' own, or none; `mean` is that of `episodes` more, from starts drawn alike. The
     control variate of PPI++: where trials began from easier starts than most, their rate is corrected by as much as the
-    prediction explains; the interval is Wilson's of as many trials as would vary as little as what it leaves.
+    prediction explains, within the interval of the trials alone; the interval is Wilson's of as many trials as would
+    vary as little as what it leaves.
     """
     count = len(success)
     if not count:
@@ -94,7 +95,8 @@ def success_rate(success: Sequence[float], predicted: Sequence[float], mean: flo
     if predicted and len({*success}) > 1 and len({*predicted}) > 1:
         slope = linear_regression(predicted, success).slope / (1 + count / episodes)
         slope = min(max(slope, 0.0), 1.0)
-        value = min(max(rate + slope * (mean - fmean(predicted)), 0.0), 1.0)
+        low, high = _wilson(rate, _NORMAL**2 / count)
+        value = min(max(rate + slope * (mean - fmean(predicted)), low), high)
     trials = float(count)
     if slope:
         whole = max(value * (1 - value), rate * (1 - rate))

@@ -103,7 +103,7 @@ def _text(results: Results, found: Estimate) -> str:
 
 def _difference(results: Results, best: str, floor: str | None) -> str:
     if floor is None:
-        return "no floor to compare with: add `direct_transfer` to `methods`"
+        return "no floor to compare with: expected `direct_transfer` among the finished methods"
     found = results.difference(best, floor)
     if found is None:
         return f"{method_title(best)} and {method_title(floor)} share no seed"

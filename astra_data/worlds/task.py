@@ -300,10 +300,13 @@ class Task:
         for one in fields(self):
             if one.name in self.derived and getattr(self, one.name) is self.derived[one.name]:
                 object.__setattr__(self, one.name, one.default)
+        made = self.make_simulator
+        while isinstance(made, partial):
+            made = made.func
         faults = [
-            f"make_simulator: {_named(self.make_simulator)} has no {name}; give the task one, or the class"
+            f"make_simulator: {_named(made)} has no {name}; give the task one, or the class"
             for name in ("abstraction", "abstract_state")
-            if getattr(self, name) is None and not hasattr(self.make_simulator, name)
+            if getattr(self, name) is None and not hasattr(made, name)
         ]
         bounds = self.commands
         commands = Commands.recorded(bounds) if isinstance(bounds, str | Path) else Commands(bounds)
@@ -311,7 +314,7 @@ class Task:
             faults.append(f"objective: action_size {size}, expected that of commands, {len(commands)}")
         if self.action and {*self.action.labels} == {*commands} and self.action.labels != (*commands,):
             faults.append(f"action: names {', '.join(self.action.labels)}, expected {', '.join(commands)}")
-        simulated = self.abstract_state or getattr(self.make_simulator, "abstract_state", None)
+        simulated = self.abstract_state or getattr(made, "abstract_state", None)
         named = {"state": self.state, "action": self.action, "goal": self.goal, "abstract_state": simulated}
         for name, column in named.items():
             names = (column and column.names) or ()
@@ -330,15 +333,15 @@ class Task:
             faults.append("name: expected letters, digits, '.', '_' and '-', since datasets are named after it")
         if faults:
             raise BadInputError(f"task '{self.name}': {'; '.join(faults)}")
-        abstract: Column = self.abstract_state or self.make_simulator.abstract_state  # type: ignore[attr-defined]
+        abstract: Column = self.abstract_state or made.abstract_state  # type: ignore[attr-defined]
         usual = {
             "instruction": self.name,
             "action": Column(ACTION, size=len(commands), names=tuple(commands)),
             "goal": Column(GOAL, size=size) if (size := self.objective.goal_size) else None,
-            "abstraction": getattr(self.make_simulator, "abstraction", None),
+            "abstraction": getattr(made, "abstraction", None),
             "abstract_state": replace(abstract, name=ABSTRACT_STATE),
             "quantities": {name: (index,) for index, name in enumerate(names_with_units(abstract))},
-            "simulator_id": _named(self.make_simulator),
+            "simulator_id": _named(made),
         }
         derived = {name: value for name, value in usual.items() if not getattr(self, name)}
         known = {"state": replace(self.state, name=STATE), "commands": commands}
@@ -426,4 +429,4 @@ class Task:
 
 
 def _named(made: object) -> str:
-    return _named(made.func) if isinstance(made, partial) else getattr(made, "__name__", type(made).__name__)
+    return getattr(made, "__name__", type(made).__name__)

@@ -124,8 +124,9 @@ def turning(folder: Path, fps: int, steps: int) -> Dataset:
     last = np.arange(steps) == steps - 1
     columns = [Column(STATE, size=6, astra=TURNS), Column(NEXT_STATE, size=6, astra=TURNS), Column(ACTION)]
     columns += [Column(REWARD), Column(TERMINATED, "bool"), Column(SUCCESS, "bool"), Column("abstract.state")]
+    columns += [Column("time")]
     values = {STATE: state[:-1], NEXT_STATE: state[1:], ACTION: np.arange(steps), REWARD: np.ones(steps)}
-    values |= {"abstract.state": np.zeros(steps)}
+    values |= {"abstract.state": np.zeros(steps), "time": 5 + time_s[:-1]}
     flags = {TERMINATED: last, SUCCESS: last & False}
     with writer(folder, columns=columns, fps=fps) as open_writer:
         floats = {name: value.astype(np.float32) for name, value in values.items()}
@@ -151,6 +152,7 @@ def test_states_at_another_rate_are_where_the_robot_was(
         np.testing.assert_allclose((2 * np.arctan2(z, w) - 3 * at + np.pi) % (2 * np.pi) - np.pi, 0, atol=1e-3)
         np.testing.assert_allclose(w**2 + z**2, 1, atol=1e-5)
     np.testing.assert_array_equal(episode.columns[ACTION], np.floor(time_s * 50 + 1e-6))
+    np.testing.assert_allclose(episode.columns["time"][:-1], 5 + time_s[:-1], atol=1e-5)
     assert episode.columns[REWARD].sum() == recorded == episode.metadata["return"]
     assert episode.columns[TERMINATED].tolist() == [*[False] * (len(episode) - 1), True]
     assert "abstract.state" not in found.features and caplog.messages[-1].endswith("abstract.state; pair it again")

@@ -165,7 +165,7 @@ def test_a_step_that_is_no_states_is_refused(
 ) -> None:
     monkeypatch.setattr(ShiftedSimulator, "step", landed)
     with pytest.raises(BadInputError, match=f"^ShiftedSimulator.step: {told}$"):
-        files.check_step(task_named(RAIL), SHIFTED, windows_of(4))
+        files.check_step(task_named(RAIL), SHIFTED, SHIFTED, windows_of(4))
 
 
 @pytest.mark.parametrize("shift_m", [0.01, 1e-5])
@@ -178,4 +178,17 @@ def test_a_step_that_leaves_its_simulator_uncorrected_is_refused(
         r"go on uncorrected: expected `return self._settle\(before, corrected\)`"
     )
     with pytest.raises(BadInputError, match=told):
-        files.check_step(task_named(RAIL), Shifted(torch.tensor([shift_m])), windows_of(4))
+        shifted = Shifted(torch.tensor([shift_m]))
+        files.check_step(task_named(RAIL), shifted, shifted, windows_of(4))
+
+
+def test_what_is_not_restored_as_it_was_or_not_finite_is_refused(tmp_path: Path) -> None:
+    whole, lost = Shifted(torch.tensor([0.01])), Shifted(torch.tensor([0.0]))
+    files.check_step(task_named(RAIL), whole, whole, windows_of(4))
+    with pytest.raises(
+        BadInputError, match=r"^Shifted\.from_file: steps of what it returns end up to 0\.01 from those"
+    ):
+        files.check_step(task_named(RAIL), whole, lost, windows_of(4))
+    with pytest.raises(BadInputError, match=r"^fit returned a Shifted with NaN or infinity in shift: expected finite"):
+        files.save_grounding(tmp_path / "g", Shifted(torch.tensor([math.nan])), no_episodes())
+    assert not (tmp_path / "g").exists()

@@ -153,6 +153,7 @@ def test_episodes_are_files_and_values_of_a_field(tmp_path: Path) -> None:
     [
         (np.round(np.arange(90) / 30, 3), 30, True),
         (np.sort(np.append(np.round(np.arange(89) / 30, 3), 1.0)), 30, True),  # a row that is written twice
+        (np.delete(np.arange(92), [7, 30]) / 10, 10, True),  # two rows that are not there
         (np.arange(90) / 29.7, 30, False),
         (np.arange(90) / 10 + 60.0 * (np.arange(90) > 50), 10, True),  # a pause
     ],
@@ -185,6 +186,10 @@ def test_rows_that_lack_a_number_are_left_out_and_counted(tmp_path: Path) -> Non
         (b"x,neigung_\xb0,cmd\n0,0,0\n1,1,1\n", "expected text in UTF-8, got the byte 0xb0: save it as UTF-8"),
         (b"t_s,x,cmd\n0,0,0\n0.4,1,1\n0.8,2,2\n", "t_s: expected rows per second within 10% of a whole number"),
         (b"run,x,cmd\n0,0,0\n1,1,1\n2,2,2\n", "found none: look at run, which cut or lack rows"),
+        (
+            b"t_s,x,cmd\n" + b"".join(b"%d,%d,%d\n" % (row // 2, row, row % 3) for row in range(20)),
+            "t_s: expected a time that rises from row to row, got 10 rows in which it stands still and 0 in which",
+        ),
     ],
 )
 def test_what_is_of_no_use_is_refused_in_one_line(content: bytes, expected: str, tmp_path: Path) -> None:
@@ -217,4 +222,11 @@ def test_a_file_of_another_rate_is_named(tmp_path: Path) -> None:
 def test_decimal_commas_are_told(tmp_path: Path) -> None:
     (tmp_path / "log.tsv").write_text("t\tx\tcmd_v\n0,0\t1\t2\n0,05\t1\t2\n")
     with pytest.raises(BadInputError, match=r"line 2: field 't': .* got '0,0': write decimal points, as in 0\.05$"):
+        guess([tmp_path])
+
+
+def test_a_link_to_nothing_is_named(tmp_path: Path) -> None:
+    write(tmp_path / "log.csv", {"x": np.arange(6), "cmd": np.arange(6) % 2})
+    (tmp_path / "lost.csv").symlink_to(tmp_path / "nothing.csv")
+    with pytest.raises(BadInputError, match=r"lost\.csv: a link to nothing: remove it"):
         guess([tmp_path])

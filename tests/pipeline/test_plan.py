@@ -79,7 +79,7 @@ def test_rows_are_made_of_every_size(tmp_path: Path) -> None:
 def test_a_part_of_a_sweep_collects_as_much_as_the_whole(tmp_path: Path) -> None:
     recipe = load(tmp_path, HEAD + "[sweep]\npercent = [50, 150]\n")
     part = Selection.of(recipe, methods=["astra"], seeds=[7], percents=[50])
-    items = {item.key: item for item in plan(recipe, tmp_path / "r.toml", tmp_path, part)}
+    items = {item.key: item for item in plan(recipe, tmp_path / "r.toml", tmp_path, part, reports=part)}
     assert list(items) == [
         "collect/seed_7",
         "pair/seed_7",
@@ -93,6 +93,8 @@ def test_a_part_of_a_sweep_collects_as_much_as_the_whole(tmp_path: Path) -> None
     assert items["collect/seed_7"].call.keywords["config"].episodes == 300  # type: ignore[attr-defined]
     options = "--method astra --seed 7 --percent 50"
     assert items["report"].call.keywords["command"].endswith(f"r.toml {options}")  # type: ignore[attr-defined]
+    *_, report = plan(recipe, tmp_path / "r.toml", tmp_path, part)
+    assert report.call.args[0].methods == recipe.methods  # type: ignore[attr-defined]
 
 
 def test_who_steps_the_target_gets_threads_and_networks_a_device(tmp_path: Path) -> None:

@@ -209,9 +209,13 @@ def test_a_rate_is_corrected_by_what_the_prediction_explains() -> None:
     weak = success_rate([1.0, 0.0, 1.0, 0.0], [0.9, 0.5, 0.5, 0.1], 0.2, 4)
     assert weak.value == pytest.approx(0.5 + 0.1 / 0.08 / 2 * (0.2 - 0.5))
     assert success_rate([1.0, 0.0, 0.0], [0.1, 0.8, 0.9], 0.4, 20) == success_rate([1.0, 0.0, 0.0], [], 0.4, 20)
-    # It stays a rate, however far the starts were from usual ones.
+    # It stays one that the trials alone allow, however far the starts were from usual ones.
     beyond = success_rate([1.0, 1.0, 0.0, 1.0], [0.2, 0.2, 0.0, 0.2], 0.9, 10**6)
-    assert beyond.value == 1.0 and beyond.high == 1.0 and beyond.low is not None and beyond.low > 0.3
+    alone = stats.binomtest(3, 4).proportion_ci(method="wilson")
+    assert beyond.value == pytest.approx(alone.high) and beyond.low is not None and beyond.low > 0.3
+    # Of one success in two trials none makes a rate of 0.
+    few = success_rate([1.0, 0.0], [1.0, 0.9], 0.4, 100)
+    assert few.value == pytest.approx(stats.binomtest(1, 2).proportion_ci(method="wilson").low)
 
 
 @pytest.mark.parametrize("rate", [0.005, 0.985, 0.995])

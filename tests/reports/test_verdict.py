@@ -123,7 +123,7 @@ def test_few_seeds_have_no_interval_and_it_says_so() -> None:
     found = verdict_of(results({"direct_transfer": (0.1, 0.1), "astra": (0.8, 0.9)}))
     assert "need 3 seeds, ASTRA has 2" in words(found)
     assert "too few seeds for an interval" in dict(found.lines)["interval"]
-    assert "add `direct_transfer`" in dict(verdict_of(results({"astra": GOOD})).lines)["interval"]
+    assert "expected `direct_transfer`" in dict(verdict_of(results({"astra": GOOD})).lines)["interval"]
     overlap = verdict_of(results({"direct_transfer": (0.5, 0.9, 0.7), "astra": (0.9, 0.6, 0.8)}))
     assert "do not show a difference" in dict(overlap.lines)["interval"]
 

@@ -136,7 +136,7 @@ class RemoteFolder:
     def read_text(self, path: str) -> str:
         """Return the text of the small file `path`, or raise a SharingError."""
         if not self.facts(path):
-            raise SharingError(f"{self.name} has no {path}: it was not pushed by astra-data.")
+            raise SharingError(f"{self.name} has no {path}: it was not pushed by astra-data, or is damaged.")
         with explained(f"{self.name}: {path}"):
             content = b"".join(self.blocks(path, TEXT_BYTES + 1))
             if len(content) > TEXT_BYTES:
@@ -353,7 +353,8 @@ def explained(place: str) -> Iterator[None]:
         raise SharingError(f"{place}: no rights to do this ({error}); check the credentials.") from error
     except (FileNotFoundError, NotADirectoryError) as error:
         raise SharingError(
-            f"{place}: does not exist or is no folder ({error}); check the spelling, or push again what is missing."
+            f"{place}: does not exist or is no folder ({error}); check the spelling, or delete a version "
+            "whose files are missing and push it again."
         ) from error
     except Exception as error:
         raise (_of_the_hub(place, error) if "Hugging Face Hub" in place else None) or SharingError(
