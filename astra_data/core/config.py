@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, Field, Tag, TypeAdapter, ValidationError
-from pydantic_core import ErrorDetails, to_jsonable_python
+from pydantic_core import ErrorDetails
 
 from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.core.naming import shortened
@@ -88,18 +88,6 @@ def as_json(**settings: Config | str | int | None) -> str:
     """Return settings as JSON, by their names."""
     plain = {k: v.model_dump(mode="json") if isinstance(v, Config) else v for k, v in settings.items()}
     return json.dumps(plain, indent=1)
-
-
-def in_full(settings: object) -> Any:  # noqa: ANN401 - as json takes them
-    """Return settings as JSON values by their present names, with what a record omits as usual, too."""
-    if isinstance(settings, BaseModel):
-        known = {name: vars(settings)[name] for name in type(settings).model_fields}
-        return in_full(known | (settings.model_extra or {}))
-    if isinstance(settings, dict):
-        return {key: in_full(value) for key, value in settings.items()}
-    if isinstance(settings, tuple):
-        return [in_full(value) for value in settings]
-    return to_jsonable_python(settings)
 
 
 def load_recipe[M: BaseModel](path: Path, model: type[M]) -> M:

@@ -19,7 +19,7 @@ from typing import Any
 
 from pydantic import JsonValue
 
-from astra_data.core.config import did_you_mean, in_full
+from astra_data.core.config import did_you_mean
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import artifact_key, base_method, reference_of
 from astra_data.io.hub.stores import is_address
@@ -88,7 +88,7 @@ def plan(
     selection, reports = selection or Selection.of(recipe), reports or Selection.of(recipe)
     items = list(_Plan(recipe, folder, selection, device).items())
     keys = tuple(selection.points())
-    about = {"name": path.stem, "task": recipe.task, "settings": in_full(recipe)}
+    about = {"name": path.stem, "task": recipe.task, "settings": recipe.settings}
     chosen, reported = (Reported(**vars(part), **about) for part in (selection, reports))
     if recipe.select and len(selection.seeds) > 1:
         of = benches(chosen, judge_of(recipe.select.judge, recipe.methods))

@@ -41,8 +41,6 @@ def _stage_field(stage: Stage) -> tuple[Any, Any]:
         return stage.config | None, _FILLED
     if stage.name == "align":
         return Annotated[stage.config, BeforeValidator(_held_out_as_ground)], _FILLED
-    if stage.name == "select":
-        return stage.config | None, Field(default=None, exclude_if=lambda table: table is None)
     return (stage.config | None, None) if stage.asked_by else (stage.config, _FILLED)
 
 
@@ -126,10 +124,10 @@ class Recipe(Config):
 
     task: str
     """A task of this package or of an installed one, or in a file next to the recipe: "cart.py:TASK"."""
-    data: str | None = Field(default=None, exclude_if=lambda data: data is None)
+    data: str | None = None
     """A dataset instead of `[collect]`: a folder next to the recipe, what dataset commands take (a folder, a
     name in the home folder, "walks@data-1.0.0"), or what `pull` takes ("user/name", "s3://…")."""
-    own_methods: dict[str, UserMethod] = Field(default_factory=dict, exclude_if=lambda methods: not methods)
+    own_methods: dict[str, UserMethod] = Field(default_factory=dict)
     """Your own methods, by the names of their rows: "delta.py:METHOD", or a table of that and settings."""
     methods: tuple[str, ...] = Field(min_length=1)
     """Rows of the results: a name in `astra_data.methods.METHODS`, alone or followed by `_plus`."""
@@ -142,7 +140,7 @@ class Recipe(Config):
 
     @property
     def settings(self) -> dict[str, JsonValue]:
-        """All settings as JSON values, as a run records them; later settings only where they take effect."""
+        """All settings as JSON values, as a run records them."""
         return self.model_dump(mode="json")
 
     @property

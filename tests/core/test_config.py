@@ -2,35 +2,10 @@ from pathlib import Path
 from typing import Literal
 
 import pytest
-from pydantic import ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 
-from astra_data.core.config import Config, faults_of, in_full, load_recipe, own_settings, validated
+from astra_data.core.config import Config, faults_of, load_recipe, own_settings, validated
 from astra_data.core.errors import BadInputError, RecipeError
-
-
-class Late(Config):
-    model_config = ConfigDict(extra="allow", serialize_by_alias=True)
-
-    doubt: float = Field(default=0.5, serialization_alias="old_doubt")
-    members: int = Field(default=0, exclude_if=lambda members: not members)
-    sizes: tuple[tuple[int, ...], ...] = ((4, 4),)
-    place: Path = Path("a/b")
-    old: int = Field(default=1, deprecated="no longer used")
-
-
-class Later(Config):
-    late: Late = Late()
-    by_name: dict[str, Late] = Field(default_factory=dict)
-    data: str | None = Field(default=None, exclude_if=lambda data: data is None)
-
-
-def test_settings_in_full_have_what_records_omit_and_their_present_names() -> None:
-    usual = {"doubt": 0.5, "members": 0, "sizes": [[4, 4]], "place": "a/b", "old": 1}
-    assert in_full(Later(by_name={"mine": Late(gain=[2])})) == {  # type: ignore[call-arg]
-        "late": usual,
-        "by_name": {"mine": usual | {"gain": [2]}},
-        "data": None,
-    }
 
 
 class Training(Config):

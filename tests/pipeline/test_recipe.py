@@ -67,7 +67,7 @@ def test_stages_get_their_tables() -> None:
     # What is collected is the largest size.
     assert recipe.config_of("collect").episodes == 20  # type: ignore[union-attr]
     assert recipe.config_of("subset") is None
-    assert "select" not in recipe.settings, "a choice is made where a recipe asks for one"
+    assert recipe.select is None, "a choice is made where a recipe asks for one"
 
 
 @pytest.mark.parametrize(

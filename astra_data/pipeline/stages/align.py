@@ -36,7 +36,7 @@ class AlignConfig(WindowedConfig):
     held_out_share: Annotated[float, Field(gt=0, lt=1)] = 0.1
     """Fraction of the episodes to hold out for measuring the agreement, unless the dataset holds some out
     itself. In a recipe this is that of `[ground]`, whose training leaves these episodes out."""
-    inputs: tuple[str, ...] = Field(default=(), exclude_if=lambda names: not names)
+    inputs: tuple[str, ...] = ()
     """Columns that the target encoder reads in place of the state, such as "observation.features.front". It then also
     estimates the abstract state, so that the policy runs without tracking."""
 

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, model_validator
 
 from astra_data.core.arrays import Floats, Ints, as_column
 from astra_data.core.checkpoint import Logbook
@@ -282,7 +282,7 @@ class CollectConfig(Config):
     the target and stopped early, which samples its actions."""
     episodes: Count = 200
     """Number of episodes: with `least_steps` the maximum."""
-    least_steps: Count | None = Field(default=None, exclude_if=lambda steps: steps is None)
+    least_steps: Count | None = None
     """Record only as many episodes as it takes to reach this many steps in total, so that datasets of
     different behaviors have the same size."""
     max_steps: Count = 500
