@@ -30,6 +30,7 @@ from astra_data.core.progress import Progress, silent
 from astra_data.core.seeding import derive, generator, held_out_episodes
 from astra_data.dataset import columns as names
 from astra_data.dataset.columns import ABSTRACT_STATE, GOAL, NEXT_STATE, OUTCOME_COLUMNS, STATE, Array, Column, Episode
+from astra_data.dataset.compare import column_faults
 from astra_data.dataset.inspection import outcome_of
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import next_version, open_dataset
@@ -273,13 +274,9 @@ def _task_of(source: Dataset, task: str | None) -> Task:
 
 
 def _check(source: Dataset, world: Task) -> None:
-    columns = {column.name: column for column in source.schema}
-    faults = [f"no column {name}" for name in _OUTCOMES if name not in columns]
-    for expected in world.state_columns:
-        size = columns[expected.name].size if expected.name in columns else "none"
-        if size != expected.size:
-            faults.append(f"{expected.name}: expected {expected.size} values per step, got {size}")
-    if ABSTRACT_STATE in columns:
+    faults = [f"has no column {name}" for name in _OUTCOMES if name not in source.features]
+    faults += [fault for expected in world.state_columns for fault in column_faults(source, expected, world.name)]
+    if ABSTRACT_STATE in source.features:
         faults.append(f"{ABSTRACT_STATE}: it has been paired; augment its parent, then pair")
     if "held_out" in source.metadata:
         faults.append("held_out: it has been augmented; augment its parent")

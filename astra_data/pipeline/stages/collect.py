@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
+from statistics import fmean
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
@@ -23,7 +24,7 @@ from astra_data.dataset.columns import OUTCOME_COLUMNS, Array, Episode
 from astra_data.dataset.inspection import outcome_of
 from astra_data.dataset.versions import home_of
 from astra_data.dataset.writer import StagedWriter
-from astra_data.policies.episodes import ObservedTargetEnv
+from astra_data.policies.episodes import Act, ObservedTargetEnv, in_target
 from astra_data.policies.ppo import Ppo, PpoConfig
 from astra_data.policies.running_policy import POLICY, Observed, PolicyFile, RunningPolicy, running
 from astra_data.policies.sac import Sac, SacConfig
@@ -260,17 +261,14 @@ def _trained(
 
 def _lasts(running: RunningPolicy, seed: int, num_threads: int | None) -> float:
     """Return how many steps episodes of the policy last on average: more than those of its training."""
-    behavior, task = PolicyBehavior(running), running.task
-    env = task.target(_TEST_EPISODES, seed=derive(seed, "starts"), num_threads=num_threads)
-    env.reset()
-    behavior.start(range(_TEST_EPISODES), seed)
-    active, lasted = torch.ones(_TEST_EPISODES, dtype=torch.bool), 0
-    for _ in range(task.objective.horizon):
-        if not active.any():
-            break
-        lasted += int(active.sum())
-        active &= ~env.step(behavior.act(env.state, env.goal), active).terminated
-    return lasted / _TEST_EPISODES
+    behavior, starts = PolicyBehavior(running), derive(seed, "starts")
+
+    def begin(goal: Tensor) -> Act:
+        behavior.start(range(len(goal)), seed)
+        return behavior.act
+
+    tested = in_target(running.task, begin, _TEST_EPISODES, starts, num_threads=num_threads)
+    return fmean(tested.outcome.steps)
 
 
 class CollectConfig(Config):
