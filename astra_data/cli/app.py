@@ -74,7 +74,7 @@ PANELS: dict[str, dict[str, Callable[..., None]]] = {
     },
     "Datasets": {
         "label logs --task cart.py:TASK": recipes.label,
-        "augment walks --copies 3 --rotations quarter": recipes.augment,
+        "augment walks --episodes 200 --rotations quarter": recipes.augment,
         "merge walks more --name all": datasets.merge,
         "filter walks --success": datasets.filter_,
         "trim logs --start 2 --without 'v < 0.05'": datasets.trim,

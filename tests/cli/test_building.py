@@ -87,21 +87,22 @@ pytestmark = pytest.mark.usefixtures("home")
 
 def test_a_dataset_is_augmented_beside_itself(home: Path) -> None:
     call("collect", "antmaze-umaze", "--episodes", "3", "--max-steps", "6", "--name", "walks")
-    options = ["--copies", "2", "--margin-m", "0.3", "--min-steps", "3", "--rotations", "none", "--seed", "5"]
+    options = ["--episodes", "7", "--margin-m", "0.3", "--min-steps", "3", "--rotations", "none", "--seed", "5"]
     result = call("augment", "walks", "--task", "antmaze-umaze", *options)
     assert result.output.splitlines()[-1] == f"finished: {home / 'walks/data-1.1.0'}"
     dataset = open_dataset("walks")
-    assert len(dataset) == 3 + 2 * 2
+    assert len(dataset) == 7
     assert dataset.description["config"] == AugmentConfig(
-        copies=2, margin_m=0.3, min_steps=3, rotations="none"
+        episodes=7, margin_m=0.3, min_steps=3, rotations="none"
     ).model_dump(mode="json")
     assert dataset.description["seeds"]["augment"] == 5
 
 
 def test_what_cannot_be_augmented_is_told(home: Path, tmp_path: Path) -> None:
-    assert "no dataset 'walks'" in str(call("augment", "walks", "--copies", "2").exception)
-    error = call("augment", str(write_fake(tmp_path / "fake").root), "--copies", "2", "--episodes", "9").exception
-    assert isinstance(error, AstraDataError) and "augment: episodes: expected either copies or episodes" in str(error)
+    options = ["--rotations", "none", "--no-translations"]
+    assert "no dataset 'walks'" in str(call("augment", "walks", *options).exception)
+    error = call("augment", str(write_fake(tmp_path / "fake").root), *options).exception
+    assert isinstance(error, AstraDataError) and "translations: expected rotations or translations" in str(error)
     assert not home.exists()
 
 

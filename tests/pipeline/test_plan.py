@@ -48,7 +48,7 @@ def test_rows_are_tested_in_one_grounded_simulator_if_the_recipe_has_it(tmp_path
 
 
 def test_a_recipe_may_augment_what_it_collects(tmp_path: Path) -> None:
-    recipe = load(tmp_path, HEAD + "[collect]\nepisodes = 50\n[augment]\ncopies = 4\n")
+    recipe = load(tmp_path, HEAD + "[collect]\nepisodes = 50\n[augment]\nepisodes = 90\n")
     items = {item.key: item for item in plan(recipe, tmp_path / "r.toml", tmp_path)}
     assert items["augment/seed_7"].inputs == ("collect/seed_7",)
     assert items["pair/seed_7"].inputs == ("augment/seed_7",)

@@ -30,7 +30,7 @@ HUMANOID = 'task = "humanoid-walker2d"\nmethods = ["astra"{}]\nseeds = [0]\n[col
     ("more", "end", "asked"),
     [
         (', "rma", "follower"', "", "methods: follower"),
-        ("", "clearance_m = 0.2\n[augment]\ncopies = 2\n", "augment, collect.clearance_m"),
+        ("", "clearance_m = 0.2\n[augment]\nepisodes = 9\n", "augment, collect.clearance_m"),
         ("", 'start = "anywhere"\n', 'collect.start = "anywhere"'),
         ("", "[evaluate]\nleg_scale = 1.25\n", "evaluate.leg_scale"),
         ("", "[report.paper_success]\nastra = 0.4\n", "report.paper_success"),

@@ -138,7 +138,7 @@ COMMANDS = {
     "push": _on_collected("push GIVEN/walks ./shared", looks.remote, "shared/walks", adds=True),
     "collect": _on_collected(f"{COLLECT} --out out --resume"),
     "pair": _on_collected("pair GIVEN/collected --simulator antmaze-umaze --out out"),
-    "augment": _on_collected("augment GIVEN/collected --copies 1 --min-steps 2 --out out"),
+    "augment": _on_collected("augment GIVEN/collected --min-steps 2 --out out"),
     **{f"{stage} of a recipe": _of_recipe(stage) for stage in STAGES},
 }
 

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from astra_data.core.arrays import Bools
-from astra_data.core.config import AtOnce, Config, Count, NotNegative
+from astra_data.core.config import Config, Count, NotNegative
 from astra_data.core.errors import BadInputError
 from astra_data.core.lazy import torch
 from astra_data.core.progress import Progress, silent
@@ -42,10 +42,10 @@ from astra_data.worlds.user_code import is_user_code
 
 Rotations = Literal["quarter", "any", "none"]
 
-_SHIFTS = 64  # shifts that are tried for each rotation
+_COPIES = 3  # of each training episode, unless the number of episodes is given
+_TRIES, _SHIFTS = 100, 64  # rotations that are tried for a copy, and shifts for each rotation
 _ROUNDING = 1e-6  # how far a rotated command may exceed the limit
 _log = logging.getLogger(__name__)
-DEFAULT_COPIES = 3
 _OUTCOMES = tuple(column.name for column in OUTCOME_COLUMNS)
 
 
@@ -64,7 +64,6 @@ class Relocation:
     translations: bool  # to anywhere; otherwise a segment starts where it did
     margin_m: float
     min_steps: int
-    tries: int  # rotations that are drawn, with 64 shifts for each, before a segment is given up
 
     def stretches(self, episode: Episode) -> list[tuple[int, int]]:
         """Return first step and end of each segment of `episode` that may be moved."""
@@ -75,11 +74,11 @@ class Relocation:
         return [(int(first), int(end)) for first, end in edges if end - first >= self.min_steps]
 
     def placements(self, episode: Episode, rng: np.random.Generator) -> Iterator[tuple[PlanarMap, slice]]:
-        """Draw segments of `episode`, in proportion to their lengths, and a placement for each, `tries` times."""
+        """Draw segments of `episode`, in proportion to their lengths, and a placement for each; try `_TRIES` times."""
         stretches = self.stretches(episode)
         lengths = np.array([end - first for first, end in stretches])
         least, largest = np.array(list(self.task.limits.values())).T
-        for _ in range(self.tries if stretches else 0):
+        for _ in range(_TRIES if stretches else 0):
             steps = slice(*stretches[rng.choice(len(stretches), p=lengths / lengths.sum())])
             angle = {"quarter": rng.integers(4) * np.pi / 2, "any": rng.uniform(-np.pi, np.pi), "none": 0.0}
             turn = PlanarMap(float(angle[self.rotations]))
@@ -148,10 +147,9 @@ def outcomes(objective: Objective, before: Array, after: Array, goal: Array, top
 class AugmentConfig(Config):
     """How many copies, and how they may differ; the paper makes 200 episodes of 50 by rotating and moving."""
 
-    copies: AtOnce | None = None
-    """Copies of each training episode; by default 3, or as many as `episodes` requires."""
     episodes: Count | None = None
-    """Total number of episodes, including originals and held-out ones; instead of `copies`."""
+    """Total number of episodes, including originals and held-out ones; by default each training episode gets
+    three copies."""
     rotations: Rotations = "any"
     """"any": by any angle that keeps the commands within their limits, which is rarer for longer commands.
     "quarter": by multiples of 90 degrees, each equally often, since these always keep commands within limits."""
@@ -159,21 +157,15 @@ class AugmentConfig(Config):
     """Move copies anywhere in the maze; otherwise a copy starts where the original did."""
     held_out_share: Annotated[float, Field(ge=0, lt=1)] = 0.1
     """Fraction of the episodes to hold out first, at least one episode unless it is 0."""
-    keep_originals: bool = True
-    """Whether the new dataset includes the training episodes themselves; it always includes held-out ones."""
     margin_m: NotNegative | None = None
     """Minimum distance to walls of copies and their originals; by default the robot's reach. With less,
     copies are longer but some of their steps are wrong: the robot stops at walls that are not there, or walks
     through walls that are (8 % of the steps on the U-Maze with 0.6 m, none with the ant's reach)."""
     min_steps: Count = 20
     """Length of the shortest stretch that is copied."""
-    tries: Count = 100
-    """Rotations to draw for a copy before giving up, with 64 places for each."""
 
     @model_validator(mode="after")
     def _changes_something(self) -> Self:
-        if self.episodes is not None and self.copies is not None:
-            raise ValueError("episodes: expected either copies or episodes, got both")
         if not self.translations and self.rotations == "none":
             raise ValueError("translations: expected rotations or translations, got neither")
         return self
@@ -214,8 +206,7 @@ def augment(
     plane = world.planar
     _check(source, world)
     margin_m = plane.wall_reach_m if config.margin_m is None else config.margin_m
-    how = {name: getattr(config, name) for name in ("rotations", "translations", "min_steps", "tries")}
-    relocation = Relocation(world, margin_m=margin_m, **how)
+    relocation = Relocation(world, config.rotations, config.translations, margin_m, config.min_steps)
     held_out, copies = _shares(source, relocation, config, seed)
     if source.cameras:
         _log.warning(f"{', '.join(source.cameras)} left out: no camera has seen the moved episodes")
@@ -231,9 +222,8 @@ def augment(
         seeds=source.description["seeds"] | {"augment": seed},
     ) as writer:
         for index, episode in enumerate(source.episodes()):
-            if held_out[index] or config.keep_originals:
-                original = {**episode.metadata, "held_out": bool(held_out[index])}
-                writer.add(Episode(episode.uid, episode.columns, original))
+            original = {**episode.metadata, "held_out": bool(held_out[index])}
+            writer.add(Episode(episode.uid, episode.columns, original))
             for copy in range(copies[index]):
                 copied = relocation.copied(episode, moving, generator(seed, f"augment {episode.uid} {copy}"))
                 if copied is None:
@@ -254,7 +244,7 @@ def augment(
                 placed += 1
             progress((index + 1) / len(source), f"{placed} copies, no place for {lost}")
         if copies.any() and not placed:
-            advice = f"lower --margin-m ({relocation.margin_m:g} m) or --min-steps, or raise --tries"
+            advice = f"lower --margin-m ({relocation.margin_m:g} m) or --min-steps"
             raise BadInputError(f"{source.reference}: found no place for any of {lost} copies: {advice}")
         skipped = int((~held_out & (copies == 0)).sum())
         writer.made = {"copies": placed, "copies_without_place": lost, "episodes_not_copied": skipped}
@@ -308,12 +298,11 @@ def _shares(source: Dataset, mover: Relocation, config: AugmentConfig, seed: int
             f"({len(held)} episodes)"
         )
     copies = np.zeros(count, dtype=np.intp)
-    copies[usable] = config.copies or DEFAULT_COPIES
+    copies[usable] = _COPIES
     if config.episodes is not None:
-        kept = count if config.keep_originals else len(held)
-        if config.episodes < kept:
-            raise BadInputError(f"--episodes {config.episodes}: expected at least {kept}, the number of episodes kept")
-        each, more = divmod(config.episodes - kept, int(usable.sum()))
+        if config.episodes < count:
+            raise BadInputError(f"--episodes {config.episodes}: expected at least {count}, the number of originals")
+        each, more = divmod(config.episodes - count, int(usable.sum()))
         copies[usable] = each
         copies[training[usable[training]][:more]] += 1
     return held_out, copies

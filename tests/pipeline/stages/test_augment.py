@@ -210,14 +210,13 @@ def test_a_share_is_held_out_at_least_one_unless_it_is_none(share: float, count:
     held_out, copies = shares(held_out_share=share)
     assert held_out.sum() == count
     usable = ~held_out & (np.arange(10) != 3)
-    assert (copies[usable] == 3).all() and (shares(held_out_share=share, copies=2)[1][usable] == 2).all()
+    assert (copies[usable] == 3).all()
     assert (len({tuple(shares(seed, held_out_share=share)[0]) for seed in range(9)}) > 1) == (share > 0)
 
 
 def test_copies_make_up_the_episodes_that_are_asked_for_and_the_odd_ones_are_of_any() -> None:
     copies = shares(episodes=23, held_out_share=0.2)[1]
     assert copies.sum() == 13 and np.ptp(copies[copies > 0]) <= 1
-    assert shares(episodes=23, held_out_share=0.2, keep_originals=False)[1].sum() == 21
     assert shares(episodes=10, held_out_share=0.2)[1].sum() == 0
     more = [shares(seed, episodes=11, held_out_share=0.2)[1].argmax() for seed in range(20)]
     assert len(set(more)) > 5
@@ -229,7 +228,7 @@ def test_copies_without_a_place_are_counted_and_none_at_all_is_an_error(
     copied, asked = Relocation.copied, iter(range(1000))
     monkeypatch.setattr(Relocation, "copied", lambda *given: copied(*given) if next(asked) % 3 == 0 else None)
     given: Any = {"dataset": collected, "seed": 0, "progress": silent}
-    config = AugmentConfig(copies=3, min_steps=5)
+    config = AugmentConfig(min_steps=5)
     told = Dataset.open(augment(None, config, out=tmp_path / "some", **given)).description
     assert told["copies_without_place"] == 2 * told["copies"] > 0
     assert told["copies"] + told["episodes_not_copied"] == 7  # all of the eight but the one held out
@@ -249,8 +248,6 @@ def test_copies_differ_from_what_they_are_of() -> None:
     assert AugmentConfig(rotations="none").translations
     with pytest.raises(ValueError, match="expected rotations or translations, got neither"):
         AugmentConfig(rotations="none", translations=False)
-    with pytest.raises(ValueError, match="expected either copies or episodes, got both"):
-        AugmentConfig(copies=2, episodes=30)
 
 
 @pytest.mark.parametrize(
@@ -258,7 +255,7 @@ def test_copies_differ_from_what_they_are_of() -> None:
     [
         ({"margin_m": 9.0}, r"none of 7 training episodes keeps 9 m from the walls for 20 steps"),
         ({"margin_m": 0.0, "min_steps": 99}, r"none of 7 training episodes keeps 0 m from .* for 99 steps"),
-        ({"episodes": 7}, r"--episodes 7: expected at least 8, the number of episodes kept"),
+        ({"episodes": 7}, r"--episodes 7: expected at least 8, the number of originals"),
     ],
 )
 def test_what_cannot_be_done_is_told(collected: Path, tmp_path: Path, changes: dict[str, Any], told: str) -> None:
