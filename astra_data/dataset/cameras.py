@@ -329,18 +329,3 @@ class ClipWriter:
                 self._output.mux(self._stream.encode())
             self._output.close()
         self._output = None
-
-
-def pooled(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the statistics over several episodes from those of each, as lerobot does; quantiles are estimates."""
-    known = [key for key in layout.STORED_STATISTICS if all(part.get(key) is not None for part in parts)]
-    if not parts or not {*known} >= {"count", "min", "max", "mean", "std"}:
-        return {}
-    values = {key: np.array([part[key] for part in parts], float) for key in known}
-    count = values["count"].reshape(-1, *([1] * (values["mean"].ndim - 1)))
-    found = {key: (value * count).sum(axis=0) / count.sum() for key, value in values.items()}
-    spread = values["std"] ** 2 + (values["mean"] - found["mean"]) ** 2
-    found |= {"min": values["min"].min(axis=0), "max": values["max"].max(axis=0)}
-    found |= {"std": np.sqrt((spread * count).sum(axis=0) / count.sum())}
-    counts = {"count": [int(values["count"].sum())]}
-    return {key: value.tolist() for key, value in found.items()} | counts

@@ -206,7 +206,10 @@ class Dataset:
         return sorted(order, key=lambda index: rank[int(self.recordings[index])])[:count]
 
     def statistics(self) -> dict[str, dict[str, Any]]:
-        """Return meta/stats.json, column to statistic to values; of a recording, min, max and mean."""
+        """Return meta/stats.json, column to statistic to values; of a recording, min, max and mean.
+
+        As lerobot's, its quantiles are estimates, from those of the episodes.
+        """
         return self._statistics
 
     @cached_property

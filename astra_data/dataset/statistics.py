@@ -1,8 +1,7 @@
-"""Exact statistics of columns in float64, with LeRobot's names and shapes."""
+"""Statistics of columns in float64, with LeRobot's names and shapes."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from tempfile import TemporaryFile
 from typing import Any
 
 import numpy as np
@@ -17,35 +16,41 @@ from astra_data.dataset.format import (
     STORED_STATISTICS,
     episodes_schema,
 )
-from astra_data.dataset.parquet import RotatingWriter, read_arrays, to_arrow, to_lists
+from astra_data.dataset.parquet import RotatingWriter, to_arrow, to_lists
 from astra_data.dataset.plain import PlainColumn
 
-BLOCK_BYTES = 2**26  # of values held in memory at once, unless those of one index are more
-_PART = 2**16  # rows that are centered at once
 ROWS_AT_ONCE = 1000  # rows held in memory before they are written
-
-
-def statistics(rows: Array) -> Floats:
-    """Return `STATISTICS` (9, size) of `rows` (size, T), sorted in place; quantiles are interpolated."""
-    # One row per index: numpy then sums pairwise, and sorting is fast.
-    count = rows.shape[1]
-    mean = rows.mean(axis=1, dtype=np.float64)
-    parts = (rows[:, first : first + _PART] - mean[:, None] for first in range(0, count, _PART))
-    std = np.sqrt(sum(np.square(part).sum(axis=1) for part in parts) / count)
-    rows.sort(axis=1)
-    position = np.array(QUANTILES) * (count - 1)
-    below = np.floor(position).astype(np.intp)
-    lower, upper = (rows[:, at].astype(np.float64) for at in (below, np.ceil(position).astype(np.intp)))
-    quantiles = lower + (upper - lower) * (position - below)
-    return np.vstack([rows[:, 0], rows[:, -1], mean, std, quantiles.T])
 
 
 def episode_statistics(columns: Iterable[Array]) -> Floats:
     """Return `STATISTICS` (9, sum of sizes) of `columns` (T,) or (T, size), side by side."""
     values = [as_rows(column) for column in columns]
-    rows = np.empty((sum(column.shape[1] for column in values), len(values[0])))
+    count = len(values[0])
+    # One row per index: numpy then sums pairwise, and sorting is fast.
+    rows = np.empty((sum(column.shape[1] for column in values), count))
     np.concatenate([column.T for column in values], out=rows)
-    return statistics(rows)
+    mean, std = rows.mean(axis=1), rows.std(axis=1)
+    rows.sort(axis=1)
+    position = np.array(QUANTILES) * (count - 1)
+    below = np.floor(position).astype(np.intp)
+    lower, upper = rows[:, below], rows[:, np.ceil(position).astype(np.intp)]
+    quantiles = lower + (upper - lower) * (position - below)
+    return np.vstack([rows[:, 0], rows[:, -1], mean, std, quantiles.T])
+
+
+def pooled(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the statistics over several episodes from those of each, as lerobot does; quantiles are estimates."""
+    known = [key for key in STORED_STATISTICS if all(part.get(key) is not None for part in parts)]
+    if not parts or not {*known} >= {"count", "min", "max", "mean", "std"}:
+        return {}
+    values = {key: np.array([part[key] for part in parts], float) for key in known}
+    count = values["count"].reshape(-1, *([1] * (values["mean"].ndim - 1)))
+    found = {key: (value * count).sum(axis=0) / count.sum() for key, value in values.items()}
+    spread = values["std"] ** 2 + (values["mean"] - found["mean"]) ** 2
+    found |= {"min": values["min"].min(axis=0), "max": values["max"].max(axis=0)}
+    found |= {"std": np.sqrt((spread * count).sum(axis=0) / count.sum())}
+    counts = {"count": [int(values["count"].sum())]}
+    return {key: value.tolist() for key, value in found.items()} | counts
 
 
 def side_by_side[C: (Column, PlainColumn)](columns: Iterable[C]) -> Iterator[tuple[C, slice]]:
@@ -54,30 +59,6 @@ def side_by_side[C: (Column, PlainColumn)](columns: Iterable[C]) -> Iterator[tup
     for column in columns:
         yield column, slice(first, first + column.size)
         first += column.size
-
-
-def global_statistics(columns: Sequence[Column], frames: int, paths: Sequence[Path]) -> dict[str, dict[str, list[Any]]]:
-    """Return meta/stats.json over all `frames`; quantiles are exact, from the values of an index side by side."""
-    stats: dict[str, dict[str, list[Any]]] = {}
-    for column in columns:
-        parts, dtype = list[Floats](), np.dtype(column.dtype)
-        most = max(1, BLOCK_BYTES // (frames * dtype.itemsize))
-        with TemporaryFile(dir=paths[0].parent) as turned:  # of each block that is read, index by index
-            lengths = list[int]()
-            for block in read_arrays(paths, [column]):
-                rows = as_rows(block[column.name])
-                turned.write(np.ascontiguousarray(rows.T).data)
-                lengths.append(len(rows))
-            for first in range(0, column.size, most):
-                values = np.empty((min(most, column.size - first), frames), dtype)
-                for end, count in zip(np.cumsum(lengths).tolist(), lengths, strict=True):
-                    turned.seek(((end - count) * column.size + first * count) * dtype.itemsize)
-                    read = np.frombuffer(turned.read(len(values) * count * dtype.itemsize), dtype)
-                    values[:, end - count : end] = read.reshape(len(values), count)
-                parts.append(statistics(values))
-        named = dict(zip(STATISTICS, np.concatenate(parts, axis=1).tolist(), strict=True))
-        stats[column.name] = {key: named.get(key, [frames]) for key in STORED_STATISTICS}
-    return stats
 
 
 def ranges(blocks: Iterable[Mapping[str, Array]]) -> dict[str, dict[str, Any]]:
@@ -107,6 +88,7 @@ class EpisodeRows:
         self._writer = RotatingWriter(root, EPISODES_PATH, self._schema, encodings, "zstd")
         self._rows: list[tuple[int, int, int]] = []
         self._statistics: list[Floats] = []
+        self._total: dict[str, Any] = {}
         self._episodes = self._frames = 0
 
     def append(self, length: int, chunk: int, file: int, statistics: Floats, pictures: Mapping[str, Any]) -> None:
@@ -126,6 +108,13 @@ class EpisodeRows:
             self._flush()
         self._writer.close()
 
+    def statistics(self) -> dict[str, dict[str, list[Any]]]:
+        """Return those of all episodes that were written, by column, as in meta/stats.json."""
+        return {
+            column.name: {key: values if key == "count" else values[part] for key, values in self._total.items()}
+            for column, part in side_by_side(self._columns)
+        }
+
     def abandon(self) -> None:
         """Close a file that is not wanted any more."""
         self._writer.abandon()
@@ -138,6 +127,9 @@ class EpisodeRows:
         episodes = np.arange(self._episodes, self._episodes + count)
         rows: list[Array] = [lengths, chunks, files, ends - lengths, ends]
         arrays = [to_arrow(episodes), pa.array([[self._task]] * count), *map(to_arrow, rows)]
+        counted = zip(self._statistics, lengths[:, None], strict=True)
+        parts = [dict(zip(STATISTICS, one, strict=True)) | {"count": steps} for one, steps in counted]
+        self._total = pooled([self._total, *parts] if self._total else parts)
         stacked = np.stack(self._statistics)
         for column, part in side_by_side(self._columns):
             if column.dtype == "float32":  # more digits would take more room than the values of short episodes

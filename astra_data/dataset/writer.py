@@ -19,12 +19,12 @@ from astra_data.dataset import columns as names
 from astra_data.dataset import description as described
 from astra_data.dataset import format as layout
 from astra_data.dataset import parquet
-from astra_data.dataset.cameras import ClipWriter, images, pooled
+from astra_data.dataset.cameras import ClipWriter, images
 from astra_data.dataset.columns import Column, Episode, Scalar
 from astra_data.dataset.parquet import to_arrow, to_numpy
-from astra_data.dataset.plain import data_files, flag_faults, open_end_faults, read_object
+from astra_data.dataset.plain import flag_faults, open_end_faults, read_object
 from astra_data.dataset.reader import Dataset
-from astra_data.dataset.statistics import EpisodeRows, episode_statistics, global_statistics
+from astra_data.dataset.statistics import EpisodeRows, episode_statistics, pooled
 
 _METADATA_TYPES = {bool: pa.bool_(), int: pa.int64(), float: pa.float64(), str: pa.string()}
 MOST_CHARACTERS = 2**20  # characters of a text in the metadata
@@ -211,7 +211,7 @@ class DatasetWriter:
         info = layout.dataset_info(self._stored, self._cameras, fps=self._fps, episodes=episodes, frames=self._frames)
         order = described.permutation(uids, self._subset_seed)
         self._write_json(layout.INFO_PATH, info)
-        stats = global_statistics(self._stored, self._frames, data_files(self._folder))
+        stats = self._rows.statistics()
         for name in self._cameras:
             known = [
                 {key: one.get(f"stats/{name}/{key}") for key in layout.STORED_STATISTICS} for one in self._rows.pictures

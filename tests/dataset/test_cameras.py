@@ -13,7 +13,7 @@ import pytest
 from fake_dataset import COLUMNS, fake_episode, write_images, writer
 
 from astra_data.core.errors import BadInputError, CorruptDatasetError
-from astra_data.dataset.cameras import ClipWriter, clip_fault, decoded, pooled
+from astra_data.dataset.cameras import ClipWriter, clip_fault, decoded
 from astra_data.dataset.columns import Clip
 from astra_data.dataset.doctor.check import check
 from astra_data.dataset.doctor.repair import repair
@@ -250,17 +250,3 @@ def test_what_does_not_fit_is_refused(source: Dataset, tmp_path: Path) -> None:
     assert "no frame at" in str(clip_fault(beyond)) and clip_fault(clips[FRONT]) is None
     single = Clip(film(tmp_path / "single.mp4", 1), FRONT, 0.0, 1 / FPS, 1)
     assert decoded(single).shape == (1, 64, 64, 3) and clip_fault(replace(single, count=2)) is not None
-
-
-def test_statistics_of_episodes_are_pooled() -> None:
-    rng = np.random.default_rng(0)
-    parts = [rng.uniform(size=(count, 3, 1, 1)) for count in (4, 10)]
-    each = [
-        {key: getattr(np, key)(part, axis=0).tolist() for key in ("min", "max", "mean", "std")} | {"count": [len(part)]}
-        for part in parts
-    ]
-    found, every = pooled(each), np.concatenate(parts)
-    for key in ("min", "max", "mean", "std"):
-        np.testing.assert_allclose(found[key], getattr(np, key)(every, axis=0))
-    assert found["count"] == [14] and pooled([each[0], {}]) == {}
-    assert [*found] == ["min", "max", "mean", "std", "count"]  # not as a set orders them, by chance

@@ -7,12 +7,10 @@ import pyarrow.parquet as pq
 import pytest
 from fake_dataset import concatenated, fake_episodes, write_fake
 
-from astra_data.dataset import parquet
-from astra_data.dataset import statistics as episode_rows
-from astra_data.dataset import statistics as statistics
+from astra_data.dataset import statistics
 from astra_data.dataset.columns import ACTION, REWARD, STATE, SUCCESS, Array, Column
 from astra_data.dataset.format import QUANTILES, STATISTICS
-from astra_data.dataset.statistics import EpisodeRows, Rounding, episode_statistics
+from astra_data.dataset.statistics import EpisodeRows, Rounding, episode_statistics, pooled
 
 NAMES = (STATE, ACTION, REWARD, SUCCESS, "mode")
 
@@ -29,23 +27,23 @@ def independent(values: Array) -> dict[str, Array]:
 def test_statistics_equal_numpy(shape: tuple[int, int]) -> None:
     values = np.random.default_rng(0).normal(100.0, 0.01, size=shape).astype(np.float32)
     expected = independent(values)
-    rows = np.array(values.T, dtype=np.float64, order="C")
-    for name, row in zip(STATISTICS, statistics.statistics(rows), strict=True):
+    for name, row in zip(STATISTICS, episode_statistics([values]), strict=True):
         np.testing.assert_allclose(row, expected[name], rtol=1e-12, atol=1e-13)
 
 
-@pytest.mark.parametrize(("block_bytes", "part", "rows"), [(1, 1, 1), (500, 20, 20), (2**24, 2**18, 2**14)])
-def test_global_statistics_are_exact(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block_bytes: int, part: int, rows: int
+@pytest.mark.parametrize("rows_at_once", [1, 2, 1000])
+def test_statistics_of_a_dataset_are_pooled_from_those_of_its_episodes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rows_at_once: int
 ) -> None:
-    monkeypatch.setattr(statistics, "BLOCK_BYTES", block_bytes)
-    monkeypatch.setattr(statistics, "_PART", part)
-    for name in ("GROUP_ROWS", "BLOCK_ROWS"):  # of a block that is read at once
-        monkeypatch.setattr(parquet, name, rows)
+    monkeypatch.setattr(statistics, "ROWS_AT_ONCE", rows_at_once)
     root = write_fake(tmp_path / "set").root
     stats = json.loads((root / "meta/stats.json").read_text())
     for name in NAMES:
         expected = independent(concatenated(name))
+        columns = [episode.columns[name] for episode in fake_episodes()]
+        each, steps = [*map(independent, columns)], [*map(len, columns)]
+        for key in expected.keys() - {"min", "max", "mean", "std"}:  # an estimate
+            expected[key] = np.average([one[key] for one in each], axis=0, weights=steps)
         assert list(stats[name]) == ["min", "max", "mean", "std", "count", "q01", "q10", "q50", "q90", "q99"]
         assert stats[name].pop("count") == [55]
         for key, values in stats[name].items():
@@ -74,6 +72,20 @@ def test_ranges_of_blocks_are_those_of_the_whole() -> None:
         for key, value in found[name].items():
             np.testing.assert_allclose(value, expected[key], rtol=1e-12)
     assert statistics.ranges([]) == {}
+
+
+def test_statistics_of_episodes_are_pooled() -> None:
+    rng = np.random.default_rng(0)
+    parts = [rng.uniform(size=(count, 3, 1, 1)) for count in (4, 10)]
+    each = [
+        {key: getattr(np, key)(part, axis=0).tolist() for key in ("min", "max", "mean", "std")} | {"count": [len(part)]}
+        for part in parts
+    ]
+    found, every = pooled(each), np.concatenate(parts)
+    for key in ("min", "max", "mean", "std"):
+        np.testing.assert_allclose(found[key], getattr(np, key)(every, axis=0))
+    assert found["count"] == [14] and pooled([each[0], {}]) == {}
+    assert [*found] == ["min", "max", "mean", "std", "count"]  # not as a set orders them, by chance
 
 
 def told(*blocks: Array) -> tuple[str, bool] | None:
@@ -105,7 +117,7 @@ LENGTHS = (4, 1, 7)
 def test_rows_locate_the_episodes_and_hold_their_statistics(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rows_at_once: int
 ) -> None:
-    monkeypatch.setattr(episode_rows, "ROWS_AT_ONCE", rows_at_once)
+    monkeypatch.setattr(statistics, "ROWS_AT_ONCE", rows_at_once)
     rng = np.random.default_rng(0)
     data = [(rng.normal(size=(length, 2)).astype(np.float32), rng.random(length) < 0.5) for length in LENGTHS]
     writer = EpisodeRows(tmp_path, COLUMNS, "walk", {})

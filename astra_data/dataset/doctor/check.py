@@ -19,11 +19,11 @@ from astra_data.dataset import columns as names
 from astra_data.dataset import description as described
 from astra_data.dataset import format as layout
 from astra_data.dataset import plain
-from astra_data.dataset.cameras import clip_fault, pooled, read_cameras
+from astra_data.dataset.cameras import clip_fault, read_cameras
 from astra_data.dataset.columns import Array
 from astra_data.dataset.parquet import read_blocks
 from astra_data.dataset.reader import Dataset, format_fault, refuse_run, refuse_versions
-from astra_data.dataset.statistics import episode_statistics, side_by_side
+from astra_data.dataset.statistics import episode_statistics, pooled, side_by_side
 
 _META_FILES = (*described.SEALED, layout.DATASET_PATH, layout.POLICY_PATH)
 MOST = 5  # findings of one kind that are shown; further ones are only counted
