@@ -88,7 +88,7 @@ def plan(
     selection, reports = selection or Selection.of(recipe), reports or Selection.of(recipe)
     items = list(_Plan(recipe, folder, selection, device).items())
     keys = tuple(selection.points())
-    about = {"name": path.stem, "task": recipe.task, "settings": recipe.settings}
+    about: dict[str, Any] = {"name": path.stem, "task": recipe.task, "settings": recipe.settings}
     chosen, reported = (Reported(**vars(part), **about) for part in (selection, reports))
     if recipe.select and len(selection.seeds) > 1:
         of = benches(chosen, judge_of(recipe.select.judge, recipe.methods))

@@ -89,7 +89,7 @@ def test_stages_get_their_tables() -> None:
         ),
         ({"sweep": {"percent": [10**9]}}, "sweep.percent.0: expected less than or equal to 10000"),
         (
-            {"task": "antmaze-umaze", "sweep": {"percent": [50]}, "augment": {"copies": 2}},
+            {"task": "antmaze-umaze", "sweep": {"percent": [50]}, "augment": {}},
             "sweep.percent: counts recorded episodes, but [augment] adds copies",
         ),
         ({"train": {"hidden_sizes": [10**9]}}, "train.hidden_sizes.0: expected less than or equal to"),
