@@ -210,7 +210,7 @@ class HubStore:
             if layout.INFO_PATH in there and SUMS_PATH not in there:
                 raise BadInputError(f"{self.repo} holds a dataset that astra-data did not push; choose another one.")
             files = dataset_files(dataset.root)
-            old = [path for path in there if path.startswith(("data/", "meta/")) and path not in files]
+            old = [path for path in there if path.startswith(("data/", "meta/", "videos/")) and path not in files]
             commit = api.create_commit(
                 self.repo,
                 [

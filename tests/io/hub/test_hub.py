@@ -41,7 +41,12 @@ def test_every_version_keeps_its_tag_and_main_shows_the_newest(hub: Hub, fake: D
     repo = hub.repos["me/it"]
     first = dict(repo.tags)
     # A file of an earlier version that the next one does not have.
-    left = repo.commits[repo.head] | {"data/chunk-000/file-001.parquet": b"", "meta/old.json": b"", "LICENSE": b""}
+    left = repo.commits[repo.head] | {
+        "data/chunk-000/file-001.parquet": b"",
+        "meta/old.json": b"",
+        "videos/a/old.mp4": b"",
+        "LICENSE": b"",
+    }
     repo.commit(left, "more files")
     newer = versioned(tmp_path / "newer", "1.10.0", fps=10)
     push(newer.root, "me/it")
