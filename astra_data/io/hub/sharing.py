@@ -29,7 +29,7 @@ def push(
     private: bool = False,
     progress: Progress = silent,
 ) -> str:
-    """Upload `dataset` with its card to `destination`; if it is there already, compare its checksums instead.
+    """Upload `dataset` with its card to `destination`; if it is there already, compare it instead.
 
     Args:
         dataset: a folder, name@data-1.2.0, or name for the newest at home.
@@ -82,6 +82,11 @@ def _refuse_change(there: stores.RemoteFolder, local: Dataset) -> None:
         raise BadInputError(
             f"{there.name} holds other values or was altered: {stores.SUMS_PATH} there differs in "
             f"{', '.join(others)}. Versions never change: make it again with another --name, or push elsewhere."
+        )
+    if changed := [path for path, digest in ours.items() if there.differs(path, local.root / path, digest)]:
+        raise SharingError(
+            f"{there.name} was altered: {', '.join(changed)} there differ from {stores.SUMS_PATH}. "
+            "Delete this version there and push it again, or push elsewhere."
         )
 
 

@@ -151,6 +151,13 @@ class RemoteFolder:
         except (RecursionError, TypeError, ValueError) as error:
             raise SharingError(f"{self.name}: {layout.DATASET_PATH} is not a JSON object ({error}).") from error
 
+    def differs(self, path: str, file: Path, digest: str) -> bool:
+        """Return whether a file is missing here or other than `file`, as far as is known without a download."""
+        if not (facts := self.facts(path)) or facts.get("size") not in (None, file.stat().st_size):
+            return True
+        found = file_digest(Path(self.path, path)) if self._is_here else (facts.get("lfs") or {}).get("sha256")
+        return found not in (None, digest)
+
     @property
     def _is_here(self) -> bool:
         protocol = self.filesystem.protocol

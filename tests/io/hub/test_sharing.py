@@ -301,7 +301,15 @@ def test_a_description_that_is_none_is_told(shared: Path, tmp_path: Path, conten
         remote.description()
 
 
-def test_other_sums_there_are_told(fake: Dataset, shared: Path, tmp_path: Path) -> None:
+def test_an_altered_remote_is_told(fake: Dataset, shared: Path, tmp_path: Path) -> None:
+    whole = (shared / DATA).read_bytes()
+    for content in (whole[:-1] + b"?", whole + b"?", None):
+        (shared / DATA).unlink()
+        if content is not None:
+            (shared / DATA).write_bytes(content)
+        with pytest.raises(SharingError, match=r"was altered: data/.*Delete this version there"):
+            push(fake.root, f"file://{tmp_path}/shared")
+        (shared / DATA).write_bytes(whole)
     sums = (shared / "SHA256SUMS").read_text()
     policy = "meta/astra/policy.safetensors"
     lines = [line for line in sums.splitlines(keepends=True) if "meta/stats" not in line]
