@@ -21,7 +21,7 @@ _MOST = 2.0  # of the logarithm of a scale: off the data no moment shall scatter
 _DESCENT = DescentConfig(updates=500, learning_rate=2e-3)
 _BATCH = 2048
 _HITS_DESCENT, _HITS_DECAY, _HITS_BATCH = DescentConfig(updates=1500, learning_rate=2e-3), 0.01, 512
-ROLLS_M_S = 0.15  # balls that are measured to be slower lie
+_ROLLS_M_S = 0.15  # balls that are measured to be slower lie
 _MOST_FORMS = 20_000
 _FAILURES, _SCATTER = "failures", "scatter"  # prefixes of the tensors and sizes of the two models in files
 
@@ -107,7 +107,7 @@ def fit_hits(model: GroundingModel, training: PairedEpisodes, seed: int) -> None
         latent, _ = model.encode(windows)
         inputs = training.steps(model.correction_inputs(latent, windows.action, windows.simulated_next))
     simulated, recorded = (training.steps(one)[:, -2:] for one in (windows.simulated_next, windows.next_state))
-    rolls = (simulated.norm(dim=-1) > ROLLS_M_S).nonzero().squeeze(1)
+    rolls = (simulated.norm(dim=-1) > _ROLLS_M_S).nonzero().squeeze(1)
     descent = Descent(model.hits, _HITS_DESCENT, weight_decay=_HITS_DECAY)
     while len(rolls) and not descent.is_over:
         rows = rolls[torch.randint(len(rolls), (_HITS_BATCH,), device=rolls.device)]
