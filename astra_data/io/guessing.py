@@ -17,7 +17,7 @@ from astra_data.dataset.columns import ACTION, GOAL, STATE, SUCCESS, TERMINATED,
 from astra_data.dataset.reader import Dataset, refuse_run, refuse_versions
 from astra_data.io.cutting import RATE_TOLERANCE
 from astra_data.io.importers.csv import SUFFIXES, decimal_comma, is_number, numbers_of, texts_of
-from astra_data.io.recording import Source, foreign, refuse_dataset
+from astra_data.io.recording import Source, foreign, refuse_broken_links, refuse_dataset
 
 Role = Literal["time", "episode", "state", "command", "goal", "failure", "success", "reward", "left out"]
 TURNED = "heading|yaw|theta|psi|compass|course|cog|azimuth|hdg"
@@ -350,8 +350,7 @@ def csv_files(place: Path) -> list[Path]:
     """Return the CSV files in a folder, or the one that `place` is; raise BadInputError if there is none."""
     inside = sorted(place.iterdir()) if place.is_dir() else [place]
     found = [path for path in inside if path.suffix.lower() in SUFFIXES]
-    if broken := [str(path) for path in found if path.is_symlink() and not path.exists()]:
-        raise BadInputError(f"{', '.join(broken)}: a link to nothing: remove it, or restore what it leads to")
+    refuse_broken_links(found)
     if not found:
         for refuse in (refuse_versions, refuse_dataset, refuse_run):
             refuse(place)

@@ -13,6 +13,7 @@ from typing import IO, cast
 from astra_data.core.config import did_you_mean
 from astra_data.core.durable import file_digest, files_below
 from astra_data.core.errors import BadInputError, in_short
+from astra_data.core.naming import first_few
 from astra_data.dataset.columns import Array
 from astra_data.dataset.format import INFO_PATH
 from astra_data.dataset.plain import read_object
@@ -262,9 +263,16 @@ def natural(name: str) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"([0-9]+)", name)]
 
 
+def refuse_broken_links(paths: Iterable[Path]) -> None:
+    """Refuse those of `paths` that are links to nothing."""
+    if broken := [str(path) for path in paths if path.is_symlink() and not path.exists()]:
+        raise BadInputError(f"{first_few(broken, 3)}: a link to nothing: remove it, or restore what it leads to")
+
+
 def _inside(recording: Path) -> list[Source]:
     """Return the files in a folder or an archive, without hidden ones."""
     if recording.is_dir():
+        refuse_broken_links(recording.rglob("*"))
         files = [path for path in files_below(recording) if _is_seen(path.relative_to(recording))]
         return [Source(path, None, recording) for path in files]
     members = [member for member in _members(recording) if _is_seen(PurePosixPath(member.name))]

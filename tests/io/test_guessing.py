@@ -9,6 +9,7 @@ import pytest
 from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError
 from astra_data.io.guessing import Logs, guess
+from astra_data.io.recording import find_sources
 
 RAMP = np.arange(6.0)
 LATE = RAMP > 4
@@ -228,5 +229,6 @@ def test_decimal_commas_are_told(tmp_path: Path) -> None:
 def test_a_link_to_nothing_is_named(tmp_path: Path) -> None:
     write(tmp_path / "log.csv", {"x": np.arange(6), "cmd": np.arange(6) % 2})
     (tmp_path / "lost.csv").symlink_to(tmp_path / "nothing.csv")
-    with pytest.raises(BadInputError, match=r"lost\.csv: a link to nothing: remove it"):
-        guess([tmp_path])
+    for read in (lambda: guess([tmp_path]), lambda: find_sources([tmp_path], "csv", [".csv"])):
+        with pytest.raises(BadInputError, match=r"lost\.csv: a link to nothing: remove it"):
+            read()
