@@ -104,6 +104,7 @@ def test_another_rate_and_other_values_are_refused(wrong: dict[str, Any], told: 
     [
         ([0.0, np.nan], [1.0], r"state: expected 2 finite values \['x', 'speed'\], got \[0.0, nan\]"),
         ([[0.0, 0.0]], [1.0], "state: expected 2 finite values"),
+        ([0.0, "fast"], [1.0], r"state: expected 2 finite values .*, got \[0.0, 'fast'\]"),
         ([0.0, 0.0], [np.inf], r"goal: expected 1 finite values \['goal_0'\], got \[inf\]"),
         ([0.0, 0.0], [], "goal: expected 1 finite values"),
     ],

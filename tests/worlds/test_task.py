@@ -1,5 +1,6 @@
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import pytest
@@ -161,3 +162,9 @@ def test_a_task_without_a_target_says_so() -> None:
 def test_fields_that_contradict_each_other_are_refused(wrong: dict[str, Any], told: str) -> None:
     with pytest.raises(BadInputError, match=told):
         Task(**GIVEN | wrong)
+
+
+def test_what_a_class_has_is_found_through_partials() -> None:
+    made, usual = Task(**GIVEN | {"make_simulator": partial(partial(Rail))}), Task(**GIVEN | {"make_simulator": Rail})
+    assert (made.abstract_state, made.abstraction) == (usual.abstract_state, usual.abstraction)
+    assert made.simulator_id == usual.simulator_id == "Rail"
