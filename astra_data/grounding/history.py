@@ -102,17 +102,14 @@ def fit_hits(model: GroundingModel, training: PairedEpisodes, seed: int) -> None
     """Fit which share of the simulator's velocity of a ball comes true, to the steps in which it rolls there."""
     assert model.hits is not None
     torch.manual_seed(derive(seed, "hits"))
-    windows = training.windows
-    with torch.no_grad():
-        latent, _ = model.encode(windows)
-        inputs = training.steps(model.correction_inputs(latent, windows.action, windows.simulated_next))
-    simulated, recorded = (training.steps(one)[:, -2:] for one in (windows.simulated_next, windows.next_state))
-    rolls = (simulated.norm(dim=-1) > _ROLLS_M_S).nonzero().squeeze(1)
+    inputs, _ = _residuals(model, training)
+    simulated, recorded = map(training.steps, (training.windows.simulated_next, training.windows.next_state))
+    rolls = (simulated[:, -2:].norm(dim=-1) > _ROLLS_M_S).nonzero().squeeze(1)
     descent = Descent(model.hits, _HITS_DESCENT, weight_decay=_HITS_DECAY)
     while len(rolls) and not descent.is_over:
         rows = rolls[torch.randint(len(rolls), (_HITS_BATCH,), device=rolls.device)]
-        share = 2.0 * model.hits(inputs[rows]).sigmoid()
-        descent.update((share * simulated[rows] - recorded[rows]).square().sum(-1).mean())
+        error = model.rolling(inputs[rows], simulated[rows]) - recorded[rows, -2:]
+        descent.update(error.square().sum(-1).mean())
 
 
 @torch.no_grad()

@@ -149,9 +149,13 @@ class GroundingModel(nn.Module):
         corrected: Tensor = simulated_next + self.correction(inputs) * self.correction_std
         if self.hits is None:
             return corrected
-        # Whether a ball is hit is a matter of centimeters: the share of the simulator's velocity that comes true.
-        rolling = 2.0 * self.hits(inputs).sigmoid() * simulated_next[..., -2:]
-        return torch.cat([corrected[..., :-2], rolling], dim=-1)
+        return torch.cat([corrected[..., :-2], self.rolling(inputs, simulated_next)], dim=-1)
+
+    def rolling(self, inputs: Tensor, simulated_next: Tensor) -> Tensor:
+        """Return the velocity (..., 2) of the ball: the share of the simulator's that comes true."""
+        assert self.hits is not None
+        share: Tensor = 2.0 * self.hits(inputs).sigmoid()
+        return share * simulated_next[..., -2:]
 
     def correction_inputs(self, latent: Tensor, action: Tensor, simulated_next: Tensor) -> Tensor:
         """Return what the correction sees of a step, (..., I)."""

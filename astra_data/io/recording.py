@@ -272,7 +272,7 @@ def refuse_broken_links(paths: Iterable[Path]) -> None:
 def _inside(recording: Path) -> list[Source]:
     """Return the files in a folder or an archive, without hidden ones."""
     if recording.is_dir():
-        refuse_broken_links(recording.rglob("*"))
+        refuse_broken_links(path for path in recording.rglob("*") if _is_seen(path.relative_to(recording)))
         files = [path for path in files_below(recording) if _is_seen(path.relative_to(recording))]
         return [Source(path, None, recording) for path in files]
     members = [member for member in _members(recording) if _is_seen(PurePosixPath(member.name))]

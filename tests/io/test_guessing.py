@@ -228,6 +228,8 @@ def test_decimal_commas_are_told(tmp_path: Path) -> None:
 
 def test_a_link_to_nothing_is_named(tmp_path: Path) -> None:
     write(tmp_path / "log.csv", {"x": np.arange(6), "cmd": np.arange(6) % 2})
+    (tmp_path / ".#log.csv").symlink_to("an editor's lock")
+    assert len(find_sources([tmp_path], "csv", [".csv"])) == 1
     (tmp_path / "lost.csv").symlink_to(tmp_path / "nothing.csv")
     for read in (lambda: guess([tmp_path]), lambda: find_sources([tmp_path], "csv", [".csv"])):
         with pytest.raises(BadInputError, match=r"lost\.csv: a link to nothing: remove it"):
