@@ -26,7 +26,6 @@ _MOST_SQUARED = 16  # values whose products are features as well; of more, only 
 _VISIBLE = 0.1  # share of the simulator's response below which a command has no visible effect
 _MATTERS = 0.05  # explained variance from which on what it adds is worth a sentence
 _HARDLY = 0.01  # share of the simulator's squared error that is not worth more recordings
-_FEW_FAILURES = 10
 
 
 @dataclass(frozen=True)
@@ -83,7 +82,6 @@ class Diagnosis:
     recordings: int
     steps: int
     responses: tuple[Response, ...]
-    best_shift: int  # steps by which the commands are shifted where the simulator's one-step error is least
     missed: tuple[Missed, ...]
     commands: dict[str, tuple[float, float, float, float]]  # given, its 1 and 99 %; bounds, low and high
     explained: dict[str, Floats]  # what predicts the error → held-out R² (1 + refits), of all, of resampled recordings
@@ -94,8 +92,6 @@ class Diagnosis:
 def diagnose(dataset: str | Path, simulator: str, progress: Progress = silent) -> Diagnosis:
     """Look at a paired dataset and its abstract simulator, as `pair` takes it, before anything is fitted."""
     source, pairing = open_dataset(dataset), pairing_named(simulator)
-    if keys.ABSTRACT_STATE not in source.features:
-        raise BadInputError(f"{source.root} has no column {keys.ABSTRACT_STATE}: expected a dataset that was paired")
     log = _Log.of(source)
     labels = {column.name: column.labels for column in source.schema}
     names = labels[keys.ACTION]
@@ -113,7 +109,6 @@ def diagnose(dataset: str | Path, simulator: str, progress: Progress = silent) -
         *_of_hidden_state([*explained.values()], shown),
         *_of_commands(log, commands),
         *_of_rates(log, source.info["fps"]),
-        *_of_failures(source, log),
         *_of_forecast(forecast, missed),
     )
     return Diagnosis(
@@ -121,7 +116,6 @@ def diagnose(dataset: str | Path, simulator: str, progress: Progress = silent) -
         recordings,
         len(log.step),
         responses,
-        felt.best_shift,
         missed,
         commands,
         explained,
@@ -178,7 +172,6 @@ class _Felt:
     changes: Floats  # (N, A, K + 1, X): where a command of K steps before takes it, by axis, less `alone`
     scale: Floats  # of the robot's motion, (X,); of values that do not move, 1
     used: Bools  # the values that move
-    best_shift: int
 
     @classmethod
     def of(cls, log: _Log, pairing: Pairing, fps: float, progress: Progress = silent) -> "_Felt":
@@ -194,18 +187,15 @@ class _Felt:
         alone = _moved(simulators, log.state[rows], np.broadcast_to(middle, (len(rows), size)))
         scale = (log.next_state[rows] - alone).std(axis=0)
         used = scale > 1e-9 * max(1.0, float(np.abs(log.state).max()))
-        scale, errors = np.where(used, scale, 1.0), []
+        scale = np.where(used, scale, 1.0)
         changes = np.empty((len(rows), size, lags + 1, len(scale)))
         for lag in range(lags + 1):
-            progress(lag / (lags + 1), f"{len(rows) * (1 + lag * (size + 1)):,} steps of the simulator")
-            past = log.action[rows - lag]
-            apart = (_moved(simulators, log.state[rows], past) - log.next_state[rows]) / scale
-            errors.append(float((apart[:, used] ** 2).sum()))
+            progress(lag / (lags + 1), f"{len(rows) * (1 + lag * size):,} steps of the simulator")
             for axis in range(size):
                 one = np.tile(middle, (len(rows), 1))
-                one[:, axis] = past[:, axis]
+                one[:, axis] = log.action[rows - lag, axis]
                 changes[:, axis, lag] = _moved(simulators, log.state[rows], one) - alone
-        return cls(rows, alone, changes, scale, used, int(np.argmin(errors)))
+        return cls(rows, alone, changes, scale, used)
 
 
 def _responses(log: _Log, felt: _Felt, names: Sequence[str], fps: float) -> tuple[Response, ...]:
@@ -482,11 +472,8 @@ def _commands(
 
 
 def _of_commands(log: _Log, commands: Mapping[str, tuple[float, float, float, float]]) -> Iterator[Finding]:
-    for index, (name, (least, largest, low, high)) in enumerate(commands.items()):
-        if np.ptp(log.action[:, index]) == 0:
-            advice = "no grounding knows what it does: record it varied, or leave it out of the commands"
-            yield Finding("warning", f"{name} never changes", advice)
-        elif min(largest, high) - max(least, low) < 0.5 * (high - low):
+    for name, (least, largest, low, high) in commands.items():
+        if min(largest, high) - max(least, low) < 0.5 * (high - low):
             yield Finding(
                 "warning",
                 f"{name} was given between {least:.3g} and {largest:.3g} alone, of {low:.3g} to {high:.3g}",
@@ -508,19 +495,4 @@ def _of_rates(log: _Log, fps: float) -> Iterator[Finding]:
             "warning",
             f"{keys.STATE} changes {rate:.3g} times a second, of {fps:g} rows",
             "it is sampled more slowly than it was logged: import with its own rate (`fps`)",
-        )
-
-
-def _of_failures(source: Dataset, log: _Log) -> Iterator[Finding]:
-    if keys.TERMINATED not in source.features:
-        return
-    names = [name for name in (keys.TERMINATED, keys.SUCCESS) if name in source.features]
-    columns = source.columns(names)
-    failed = columns[keys.TERMINATED] & ~columns.get(keys.SUCCESS, np.zeros(len(log.step), bool))
-    count = int(failed.sum())
-    if count < _FEW_FAILURES:
-        yield Finding(
-            "note",
-            f"{count} episodes end in a failure",
-            f"a failure model wants {_FEW_FAILURES} or more: record some, or do not use `astra_plus` where it can fail",
         )

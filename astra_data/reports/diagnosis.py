@@ -32,9 +32,7 @@ def diagnosis_page(recipe: str, found: Diagnosis, timestep_s: float) -> str:
     meaning = Text(
         "The robot's motion as a sum of what the simulator does for the present and the past commands: effect is the "
         "sum of their shares (1: as much as in the simulator), delay their mean lag, dead time and time constant "
-        f"together. Intervals are a bootstrap over recordings. Of single shifts of all commands, {found.best_shift} of "
-        "these steps leave the least one-step error; where a lag spreads an effect over many steps, that is less than "
-        "the mean."
+        "together. Intervals are a bootstrap over recordings."
     )
     given_table = TableBlock("", ["command", "1 % lie below", "99 % lie below", "lower bound", "upper bound"], given)
     delay_table = TableBlock("", ["command", "delay (s) [95 %]", "effect [95 %]", shape], delays)
