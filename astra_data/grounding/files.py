@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
 GROUNDING, TARGET_ENCODER = "grounding.safetensors", "target_encoder.safetensors"  # files of their artifacts
 _TARGET_ENCODER = "target encoder"
-_WRITTEN = ("kind", "to_file", "from_file")  # the parts that a grounding does not inherit
 _ROUNDING = 1e-6  # between states that are the same, relative to their size and absolute
 
 
@@ -72,15 +71,6 @@ def load_target_encoder(path: Path | str) -> "TargetEncoder":
 
     with understood(Path(path), "a target encoder", (_TARGET_ENCODER,), "cpu") as (tensors, metadata):
         return loaded(TargetEncoder(**metadata["sizes"]), tensors)
-
-
-def missing_parts(grounding: type) -> list[str]:
-    """Return the parts of a `FittedGrounding` that a class has not, and does not inherit."""
-    inherited = [name for name in vars(Grounding) if not name.startswith("_")]
-    has = {name for one in grounding.__mro__ if one not in FittedGrounding.__mro__ for name in vars(one)}
-    if FittedGrounding in grounding.__mro__:
-        has |= {*inherited} - {*_WRITTEN}
-    return [name for name in dict.fromkeys((*_WRITTEN, *inherited)) if name not in has]
 
 
 def fitted(returned: object) -> tuple[FittedGrounding, dict[str, Any]]:

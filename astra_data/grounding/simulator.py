@@ -1,5 +1,6 @@
 """The abstract simulator that episodes are run in: raw or varied; groundings correct its steps."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self
@@ -111,7 +112,7 @@ class EpisodeSimulator:
             self._remembering.memory = state["memory"].clone()
 
 
-class Grounding(Protocol):
+class Grounding:
     """How an abstract simulator is corrected, if it is."""
 
     start_stride: ClassVar[int] = 1  # recorded steps between those that episodes may start from
@@ -142,19 +143,19 @@ class Grounding(Protocol):
         return self
 
 
-class FittedGrounding(Grounding, Protocol):
+class FittedGrounding(Grounding, ABC):
     """A grounding that was fitted to pairs, and can be saved."""
 
     kind: ClassVar[str]  # names the class in files; see `files.KINDS`
 
+    @abstractmethod
     def to_file(self) -> tuple[Mapping[str, Tensor], dict[str, Any]]:
         """Return tensors, at least one, and metadata (JSON values) from which `from_file` rebuilds it."""
-        ...
 
     @classmethod
+    @abstractmethod
     def from_file(cls, tensors: dict[str, Tensor], metadata: Mapping[str, Any], device: str) -> Self:
         """Rebuild it on `device`, with frozen parameters."""
-        ...
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,9 @@ from pathlib import Path
 from astra_data.core.config import Config, did_you_mean
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import PLUS, base_method, is_plus
-from astra_data.grounding.files import kinds, missing_parts
+from astra_data.grounding.files import kinds
 from astra_data.grounding.fit import HistoryFit
+from astra_data.grounding.simulator import Grounding
 from astra_data.methods import astra, follower, iql
 from astra_data.methods.method import Method, Table
 from astra_data.methods.rma import RMA
@@ -80,9 +81,12 @@ def _faults(method: Method) -> Iterator[str]:
     """Yield what a method of the user's lacks to be a row."""
     if method.learn is None:
         yield "learns no policy: expected learn, an UserLearner that returns one"
-    if method.grounding is not None and (missing := missing_parts(method.grounding)):
-        lacks = f"has a grounding, {method.grounding.__name__}, without {', '.join(missing)}"
-        yield f"{lacks}: expected a subclass of FittedGrounding"
+    if (made := method.grounding) is not None:
+        abstract = getattr(made, "__abstractmethods__", ())
+        missing = [one for one in ("kind", "to_file", "from_file") if one in abstract or not hasattr(made, one)]
+        if missing or not issubclass(made, Grounding):
+            lacks = f"has a grounding, {made.__name__}, without {', '.join(missing) or 'the other parts'}"
+            yield f"{lacks}: expected a subclass of FittedGrounding"
     if (table := method.table) is None:
         return
     if not issubclass(table.model, Config):
