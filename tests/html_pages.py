@@ -11,18 +11,16 @@ class Page(HTMLParser):
     """What is on a page.
 
     Attributes:
-        tables: caption → lines of cells, the head first.
-        scopes: of each header cell.
+        tables: the paragraph or heading above → lines of cells, the head first.
         tags: name and attributes of each element, in order.
         words: all text outside of styles.
     """
 
     tables: dict[str, list[list[str]]] = field(default_factory=dict)
-    scopes: list[str | None] = field(default_factory=list)
     tags: list[tuple[str, dict[str, str | None]]] = field(default_factory=list)
     words: str = ""
     _open: list[str] = field(default_factory=list)
-    _caption: str = ""
+    _above: str = ""
 
     def __post_init__(self) -> None:
         super().__init__()
@@ -32,14 +30,12 @@ class Page(HTMLParser):
         self.tags.append((tag, values))
         if tag not in VOID:
             self._open.append(tag)
-        if tag == "caption":
-            self._caption = ""
+        if tag in ("p", "h2", "h3"):
+            self._above = ""
         elif tag == "tr":
-            self.tables.setdefault(self._caption, []).append([])
+            self.tables.setdefault(self._above, []).append([])
         elif tag in ("td", "th"):
-            self.tables[self._caption][-1].append("")
-            if tag == "th":
-                self.scopes.append(values.get("scope"))
+            self.tables[self._above][-1].append("")
 
     def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.tags.append((tag, dict(attrs)))
@@ -51,18 +47,18 @@ class Page(HTMLParser):
         if "style" in self._open:
             return
         self.words += data
-        if "caption" in self._open:
-            self._caption += data
-        elif "td" in self._open or "th" in self._open:
-            self.tables[self._caption][-1][-1] += data
+        if "td" in self._open or "th" in self._open:
+            self.tables[self._above][-1][-1] += data
+        elif {"p", "h2", "h3"} & {*self._open}:
+            self._above += data
 
     def attributes(self, tag: str) -> list[dict[str, str | None]]:
         """Return the attributes of all elements of a kind."""
         return [attributes for name, attributes in self.tags if name == tag]
 
-    def table(self, caption: str) -> list[list[str]]:
-        """Return the table whose caption begins so."""
-        (found,) = [lines for title, lines in self.tables.items() if title.startswith(caption)]
+    def table(self, title: str) -> list[list[str]]:
+        """Return the table below the paragraph that begins so."""
+        (found,) = [lines for above, lines in self.tables.items() if above.startswith(title)]
         return found
 
     @property

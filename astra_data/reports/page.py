@@ -75,8 +75,8 @@ def sections_of(results: Results, run: str) -> list[Section]:
     return [
         *sections,
         Section("Training and cost", [*pictures(results, "training"), *_costs(results)]),
-        Section("Every seed", [*_every_seed(results)], folded=True),
-        Section("Provenance", [*_provenance(results)], folded=True),
+        Section("Every seed", [*_every_seed(results)]),
+        Section("Provenance", [*_provenance(results)]),
     ]
 
 

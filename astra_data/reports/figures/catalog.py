@@ -22,7 +22,6 @@ class Drawing:
     title: str
     caption: str
     section: Literal["methods", "gap", "failures", "validity", "sizes", "training"]
-    photo: bool = False
 
 
 _BARS = "Bars: means over seeds, also as numbers beside the names. Dots: single seeds. Lines: 95 % intervals."
@@ -50,7 +49,6 @@ FIGURES = {
         "The target at the times above the pictures, in the first evaluation episode of the first seed; all "
         "methods have the same start. A strip ends with its episode.",
         "methods",
-        photo=True,
     ),
     "gap": Drawing(
         charts.open_loop_error,
@@ -112,7 +110,7 @@ def pictures(results: Results, section: str) -> list[Picture]:
     """Return the figures of a section as blocks of a page."""
     where = results.where
     return [
-        Picture(name, one.title.replace("{where}", where), one.caption.replace("{where}", where), one.photo)
+        Picture(name, one.title.replace("{where}", where), one.caption.replace("{where}", where))
         for name, one in FIGURES.items()
         if one.section == section
     ]

@@ -252,7 +252,7 @@ def test_what_no_target_tested_is_said_before_all_else(root: Path) -> None:
         path.unlink()
     make(root, recipe=FakeRecipe(methods=ROWS[:3]))
     page = (root / "report/results.md").read_text()
-    assert page.splitlines()[2].startswith("**Nothing was tested on a robot: the task has no target.**")
+    assert page.splitlines()[2].startswith("> **Nothing was tested on a robot: the task has no target.**")
     assert "Try first" in page and "Does a simulator show" not in page
 
 
