@@ -1,5 +1,6 @@
 """Methods of a user's own whose correction is known: each step ends a little further along the first axis."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Self
@@ -67,6 +68,8 @@ METHOD = Method(
 LOSSY = Method(name="lossy", title="Lossy", fit=lambda fitting: (Lossy(shift_of(fitting)), {}), grounding=Lossy)
 UNNAMED = replace(LOSSY, grounding=None)
 CLASHING = replace(METHOD, fit=lambda fitting: (Shifted(shift_of(fitting)), {"failures": 3, "machine": ""}))
+WRONG: dict[Any, Any] = {"loss": torch.zeros(()), "r2": [1.0, math.nan], 2: 0.1}
+UNWRITABLE = replace(METHOD, fit=lambda fitting: (Shifted(shift_of(fitting)), WRONG))
 
 
 class NarrowSimulator(ShiftedSimulator):

@@ -1,6 +1,5 @@
 """Groundings and target encoders on disk: safetensors files with metadata."""
 
-import json
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -87,13 +86,6 @@ def fitted(returned: object) -> tuple[FittedGrounding, dict[str, Any]]:
         )
     if not isinstance(figures, dict):
         raise BadInputError(f"fit returned a {type(figures).__name__} of figures: expected a dict")
-    if unnamed := [f"{key!r}" for key in figures if not isinstance(key, str)]:
-        raise BadInputError(f"the figures of fit are named {', '.join(unnamed)}: expected texts")
-    if faults := [f"{key!r} {fault}" for key, value in figures.items() if (fault := _fault(value))]:
-        raise BadInputError(
-            f"the figures of fit: {', '.join(faults)}: expected numbers, texts, lists or dicts, such as "
-            "those of value.tolist(), or None for what is not known"
-        )
     return grounding, figures
 
 
@@ -129,14 +121,3 @@ def check_step(task: Task, fit: FittedGrounding, written: FittedGrounding, episo
             f"{type(fit).__name__}.from_file: steps of what it returns end up to {apart} from those of what fit "
             "returned: expected what to_file wrote"
         )
-
-
-def _fault(value: object) -> str:
-    """Return why a figure cannot be written as JSON; nothing if it can."""
-    try:
-        json.dumps(value, allow_nan=False)
-    except TypeError:
-        return f"is a {type(value).__name__}"
-    except ValueError:
-        return "is not finite"
-    return ""

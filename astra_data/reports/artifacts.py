@@ -128,7 +128,10 @@ class Foresight(WrittenPart):
 
 
 class Metrics(Artifact):
-    """metrics.json of one row and seed's grounding or alignment."""
+    """metrics.json of one row and seed's grounding or alignment; further figures are kept as they are."""
+
+    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
+    __pydantic_extra__: dict[str, JsonValue]
 
     windows_per_second: float | None = None
     episodes_per_second: float | None = None

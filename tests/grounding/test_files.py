@@ -3,7 +3,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from shifted_method import Lossy, Shifted, ShiftedSimulator
@@ -118,18 +117,6 @@ def test_what_a_grounding_of_one_s_own_saves_and_asks_for_is_checked(
             "fit returned a Lossy, which cannot be read again: expected grounding=Lossy of the Method",
         ),
         ((torch.zeros(1), {}), "fit returned a Tensor, which cannot be read again"),
-        (
-            (SHIFTED, {"a": 1, "loss": torch.zeros(()), "n": np.int64(3)}),
-            "the figures of fit: 'loss' is a Tensor, 'n' is a int64: expected numbers, texts, lists or dicts",
-        ),
-        (
-            (SHIFTED, {"r2": math.nan, "losses": [1.0, -math.inf]}),
-            "the figures of fit: 'r2' is not finite, 'losses' is not finite: expected .* or None for what",
-        ),
-        (
-            (SHIFTED, {("train", "loss"): 0.5, 2: 0.1}),
-            r"the figures of fit are named \('train', 'loss'\), 2: expected texts",
-        ),
     ],
 )
 def test_what_is_no_such_pair_is_refused(returned: object, told: str, known: None) -> None:

@@ -65,9 +65,12 @@ def ground(
         fit_end = stopwatch.spent()
         figures = made | fit_end | metrics
         try:
-            Metrics.model_validate(figures)  # a fit of the user's may return others under the names of reports
+            Metrics.model_validate(figures)  # a fit of the user's may return any
         except ValidationError as error:
-            raise BadInputError(f"the figures of fit: {faults_of(error)}: give them other names") from None
+            raise BadInputError(
+                f"the figures of fit: {faults_of(error)}: expected JSON values, such as those of value.tolist(), "
+                "None for what is not known, and other names than those of reports"
+            ) from None
         progress(1.0, "gap report")
         save_grounding(folder / GROUNDING, grounding, episodes)
         written = load_grounding(folder / GROUNDING, device)  # what policies are trained in

@@ -125,7 +125,11 @@ def test_the_time_is_that_of_the_whole_stage(
         ("UNNAMED", "expected grounding=Lossy"),
         ("LOSSY", r"^Lossy\.from_file: steps of what it returns end up to"),
         ("NARROW", "got"),
-        ("CLASHING", "^the figures of fit: machine: .*; failures: .*: give them other names"),
+        ("CLASHING", "^the figures of fit: machine: .*; failures: .*: expected .* other names than those of reports"),
+        (
+            "UNWRITABLE",
+            "figures of fit: loss: .* JSON value; r2.list.1.float: .* finite number; 2: Keys .*: expected JSON",
+        ),
     ],
 )
 def test_a_grounding_that_no_policy_could_be_trained_in_or_no_report_be_made_of_is_not_written(
