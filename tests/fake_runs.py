@@ -72,7 +72,6 @@ def write_evaluation(root: Path, method: str, seed: int, percent: int | None = N
         **MADE,
         "wall_seconds": 10.0,
         "cpu_seconds": 20.0,
-        "target_steps_per_second": 1000.0 + seed,
         **({} if method == "follower" else {"encoder": "target"}),
         "target": outcomes(SUCCESS[method][seed], seed),
         "raw": outcomes([1, 1, 1, 1], seed) | {"return": [float(seed**2)] * 4},
@@ -100,12 +99,10 @@ def write_runs(parent: Path) -> Path:
     root = parent / "runs" / "antmaze_u"
     for seed in SEEDS:
         identity = {"name": "antmaze-u-random", "version": "data-1.0.0", "content_hash": f"hash{seed}"}
-        took = {"wall_seconds": 5.0, "target_steps_per_second": 2000.0 * (seed + 1)}
-        write_json(root / f"collect/seed_{seed}/meta/astra/dataset.json", identity | MADE | took)
+        write_json(root / f"collect/seed_{seed}/meta/astra/dataset.json", identity | MADE | {"wall_seconds": 5.0})
         write_json(root / f"pair/seed_{seed}/meta/astra/dataset.json", identity | MADE)
         ground = root / f"ground/astra/seed_{seed}"
-        metrics = {"windows_per_second": 100.0 * seed, "wall_seconds": 7.0, "cpu_seconds": 14.0}
-        write_json(ground / "metrics.json", metrics | MADE)
+        write_json(ground / "metrics.json", {"wall_seconds": 7.0, "cpu_seconds": 14.0} | MADE)
         grounded, raw = {"position_m": band(0.1 * (seed + 1))}, {"position_m": band(1.0)}
         write_json(ground / "gap.json", {"horizons": [1, 10], "grounded": grounded, "raw": raw})
         for method in ROWS:
@@ -116,10 +113,7 @@ def write_runs(parent: Path) -> Path:
                     {"steps": 1000, "success": 0.5, "entropy": 0.5},
                     {"steps": 2000, "success": 0.75, "entropy": 0.2},
                 ]
-                write_json(
-                    root / f"train/{method}/seed_{seed}/curve.json",
-                    MADE | {"steps_per_second": 48000.0, "simulator_steps_per_second": 96000.0, "points": points},
-                )
+                write_json(root / f"train/{method}/seed_{seed}/curve.json", MADE | {"points": points})
     return root
 
 

@@ -311,7 +311,7 @@ def _optimize(iql: Iql, training: Training) -> dict[str, Any]:
             # No policy acts while learning from recorded episodes, so there is no success rate.
             points.append({"steps": iql.updates, "success": None, **losses})
             logbook.keep(iql.state_dict())
-    return {"updates_per_second": iql.updates / stopwatch.seconds, **stopwatch.spent(), "points": points}
+    return {**stopwatch.spent(), "points": points}
 
 
 IQL = Method(

@@ -35,7 +35,6 @@ from astra_data.pipeline.plan import Selection, check_stage, plan, stages_until
 from astra_data.pipeline.recipe import WHOLE
 from astra_data.pipeline.shipped import is_shipped
 from astra_data.pipeline.stages.registry import STAGES
-from astra_data.pipeline.stages.report import is_current
 from astra_data.pipeline.user_code import UserMethod, add_all, digests_of
 from astra_data.reports.artifacts import CURVE, EVALUATION, METRICS, Artifact, Evaluation, read_json
 from astra_data.reports.diagnosis import DIAGNOSIS, diagnosis_page
@@ -225,10 +224,6 @@ def make(
         clean(folder)
         again = to_make_again(items, experiment)
         items = [one for one in items if one.key in again or one.stage in ALWAYS_NEW or not experiment.has(one.key)]
-        if [item.stage for item in items] == ["report"]:
-            call: Any = items[0].call
-            is_there = call.keywords["publish"] is None and is_current(*call.args, **call.keywords)
-            items = [] if is_there else items
         data = data_condition(recipe) if any(item.stage == "label" for item in items) else None
         _check_inputs(experiment, items, planned)
         experiment.link_borrowed()

@@ -45,10 +45,8 @@ class Artifact(WrittenPart):
     machine: Machine | None = None
 
     def numbers(self) -> dict[str, float | None]:
-        """Return what the stage recorded of itself, as `Results.lines` hold it: its times and speeds."""
-        times = ("wall_seconds", "cpu_seconds", "finished_at")
-        names = [name for name in type(self).model_fields if name in times or name.endswith("_per_second")]
-        return {name: getattr(self, name) for name in names}
+        """Return what the stage recorded of itself, as `Results.lines` hold it: its times."""
+        return {name: getattr(self, name) for name in ("wall_seconds", "cpu_seconds", "finished_at")}
 
 
 class Outcomes(WrittenPart):
@@ -78,7 +76,6 @@ class Evaluation(Artifact):
     leg_scale: float = 1.0
     dataset_version: str | None = None
     dataset_hash: str | None = None
-    target_steps_per_second: float | None = None
     tested_in: Literal["target", "grounded", "raw"] = "target"  # a simulator, if the task has no target
     target: Outcomes | None = None
     simulated: Outcomes | None = None  # in the simulator that the policy was trained in; None if it was trained in none
@@ -106,15 +103,12 @@ class CurvePoint(WrittenPart):
 class CurveFile(Artifact):
     """curve.json of one row and seed."""
 
-    simulator_steps_per_second: float | None = None
-    steps_per_second: float | None = None
-    updates_per_second: float | None = None
     points: list[CurvePoint] = Field(min_length=1)
     tries: list[dict[str, JsonValue]] = Field(default_factory=list)
     """Of a training that may be done again: what each try reached; the points are those of the one kept."""
 
     def numbers(self) -> dict[str, float | None]:
-        """Return times, speeds and the number of tries."""
+        """Return times and the number of tries."""
         return {**super().numbers(), "tries": float(len(self.tries)) or None}
 
 
@@ -133,15 +127,12 @@ class Metrics(Artifact):
     model_config = ConfigDict(extra="allow", allow_inf_nan=False)
     __pydantic_extra__: dict[str, JsonValue]
 
-    windows_per_second: float | None = None
-    episodes_per_second: float | None = None
-    replays_per_second: float | None = None
     epochs: list[dict[str, JsonValue]] = Field(default_factory=list)
     """Losses and R² on held-out episodes during the fit; the last are those of the grounding."""
     failures: dict[str, Foresight] = Field(default_factory=dict)  # by what predicts them; empty without a failure model
 
     def numbers(self) -> dict[str, float | None]:
-        """Return times, speeds, the last R² and, by dotted names, the figures of predicted failures."""
+        """Return times, the last R² and, by dotted names, the figures of predicted failures."""
         last = self.epochs[-1] if self.epochs else {}
         explained = dict(_flat({name: value for name, value in last.items() if name.startswith("r2_")}))
         return super().numbers() | explained | dict(_flat(self.model_dump(include={"failures"})))
@@ -181,8 +172,6 @@ class DatasetFile(Artifact):
     name: str
     version: str
     content_hash: str
-    target_steps_per_second: float | None = None
-    pairs_per_second: float | None = None
 
 
 def read_json[T: Artifact](model: type[T], path: Path) -> T:

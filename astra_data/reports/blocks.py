@@ -70,14 +70,6 @@ def listed(words: Sequence[str]) -> str:
     return " and ".join(filter(None, (", ".join(words[:-1]), *words[-1:])))
 
 
-def short(rate: float) -> str:
-    """Return a rate with three significant digits, in thousands from 1000 on, then in millions."""
-    for unit, size in (("M", 1e6), ("k", 1e3)):
-        if rate >= 0.9995 * size:
-            return f"{rate / size:.3g} {unit}"
-    return f"{rate:.3g}"
-
-
 def duration(seconds: float | None) -> str:
     """Return a time in seconds, minutes or hours; a dash for None."""
     if seconds is None:

@@ -9,7 +9,7 @@ import numpy as np
 from astra_data.core.naming import base_method, in_code, is_plus, reference_of
 from astra_data.core.progress import CLOCKS
 from astra_data.methods import grounded_as, method_named, method_role, method_title
-from astra_data.reports.blocks import Block, Code, Section, TableBlock, Text, duration, short
+from astra_data.reports.blocks import Block, Code, Section, TableBlock, Text, duration
 from astra_data.reports.choice import choice_blocks
 from astra_data.reports.figures.catalog import pictures
 from astra_data.reports.held_out import gap_blocks
@@ -275,15 +275,13 @@ def _sizes(results: Results) -> Iterator[Block]:
 
 def _costs(results: Results) -> Iterator[Block]:
     wall, cpu = (stage_seconds(results, clock) for clock in CLOCKS)
-    speeds = _speeds(results)
     stages = (*DATASET_STAGES, "ground", "train", "align", "select", "evaluate")
-    shown = [stage for stage in stages if stage in wall or stage in speeds]
-    lines = [[of, duration(wall.get(of)), duration(cpu.get(of)), speeds.get(of, "")] for of in shown]
+    lines = [[of, duration(wall[of]), duration(cpu.get(of))] for of in stages if of in wall]
     elapsed = elapsed_seconds(results)
-    total = ["whole recipe", duration(sum(wall.values())), duration(sum(cpu.values()) or None), ""]
+    total = ["whole recipe", duration(sum(wall.values())), duration(sum(cpu.values()) or None)]
     yield Text(f"Wall time of the whole recipe: {duration(elapsed)}, in which several stages may run at once.")
-    head = ["stage", "time", "CPU time", "speed"]
-    yield TableBlock("Time of each stage, added up over methods and seeds", head, [*lines, total])
+    title = "Time of each stage, added up over methods and seeds"
+    yield TableBlock(title, ["stage", "time", "CPU time"], [*lines, total])
     per_row = []
     for row in results.tested():
         found, spent = ([_cost(results, stage, row, clock) for stage in COSTED] for clock in CLOCKS)
@@ -291,10 +289,7 @@ def _costs(results: Results) -> Iterator[Block]:
         per_row.append([method_title(row), *map(duration, found + sums)])
     head = ["method", *COSTED, "in all", "CPU time"]
     yield TableBlock("Time for one seed of each method, with the grounding and alignment that it uses", head, per_row)
-    yield Text(
-        "A dash: no time was recorded. CPU time: of all threads. Speed: of one item while others run, "
-        "averaged over seeds. Simulator steps/s: without learning; training steps/s: with learning."
-    )
+    yield Text("A dash: no time was recorded. CPU time: of all threads.")
 
 
 def _cost(results: Results, stage: str, row: str, clock: str) -> float | None:
@@ -303,21 +298,6 @@ def _cost(results: Results, stage: str, row: str, clock: str) -> float | None:
     owners = filter(None, (grounded_as(row) if stage in ("ground", "align") else row, initial))
     known = [found.value for owner in owners if (found := results.summary(owner, clock, stage))]
     return sum(known) if known else None
-
-
-def _speeds(results: Results) -> dict[str, str]:
-    table = results.table
-    found = table[table["measure"].str.endswith("_per_second")]
-    texts: dict[str, list[str]] = {}
-    for (stage, figure), of in found.groupby(["where", "measure"], sort=False):
-        means = of.groupby("row", sort=False)["value"].mean()
-        low, high = means.idxmin(), means.idxmax()
-        text = short(means[low])
-        if short(means[low]) != short(means[high]):
-            text = f"{text} ({method_title(low)}) to {short(means[high])} ({method_title(high)})"
-        steps = figure.removesuffix("_per_second").replace("_", " ")
-        texts.setdefault(stage, []).append(f"{text} {'training ' if steps == 'steps' else ''}{steps}/s")
-    return {stage: "; ".join(of) for stage, of in texts.items()}
 
 
 def _every_seed(results: Results) -> Iterator[Block]:

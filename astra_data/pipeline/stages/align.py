@@ -129,7 +129,6 @@ def align(
             r2 = agreement["latent_r2"]
             progress(1.0, f"ψ^t explains {r2:.2f} of the latents' variance: the policy runs with {encodes}")
         metrics: dict[str, Any] = made | {
-            "windows_per_second": descent.done * config.batch_windows / descent.stopwatch.seconds,
             **descent.stopwatch.spent(),
             "points": descent.points,
             **agreement,

@@ -353,7 +353,7 @@ def collect(
         rate = steps / (time.perf_counter() - trained)
         returns, successes = zip(*((m["return"], m["success"]) for m in writer.staged.values()), strict=True)
         metadata |= {"return_mean": float(np.mean(returns)), "success_rate": float(np.mean(successes))}
-        writer.made = {"behavior": metadata, **stopwatch.spent(), "target_steps_per_second": rate}
+        writer.made = {"behavior": metadata, **stopwatch.spent()}
     note = f"return {metadata['return_mean']:.2f}, success {metadata['success_rate']:.2f}"
     progress(1.0, f"{len(returns)} episodes, {note}, {rate:,.0f} target steps/s")
     return folder

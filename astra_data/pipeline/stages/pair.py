@@ -1,7 +1,6 @@
 """Pair: reset the abstract simulator to φ(s), step it with the recorded action, and store its next state."""
 
 import logging
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -70,7 +69,7 @@ def pair(
         keys.ABSTRACT_SIMULATED_NEXT_STATE: "where the abstract simulator lands, reset to abstract.state",
     }
     added = [replace(pairing.abstract_state, name=name, meaning=text) for name, text in meanings.items()]
-    steps, simulating, reset_error, farthest = 0, 0.0, 0.0, np.zeros(added[0].size)
+    steps, reset_error, farthest = 0, 0.0, np.zeros(added[0].size)
     jumps = {unit: np.zeros(added[0].size, np.int64) for unit in TURNS}
     with next_version(
         source,
@@ -83,14 +82,12 @@ def pair(
         simulator={"id": pairing.id, **pairing.origin, **batch.parameters, **bounds},
     ) as writer:
         for episodes in in_blocks(source.episodes(), _BLOCK):
-            before = time.perf_counter()
             columns = [
                 np.concatenate([one.columns[name] for one in episodes])
                 for name in (keys.STATE, keys.ACTION, keys.NEXT_STATE)
             ]
             tolerance = config.reset_tolerance
             paired, error = pair_steps(pairing, batch, *map(as_rows, columns), tolerance=tolerance, first_step=steps)
-            simulating += time.perf_counter() - before
             reset_error = max(reset_error, error)
             apart = paired[keys.ABSTRACT_NEXT_STATE] - paired[keys.ABSTRACT_SIMULATED_NEXT_STATE]
             for unit, turn in TURNS.items():
@@ -104,13 +101,7 @@ def pair(
             steps += first
             rate = steps / stopwatch.seconds
             progress(steps / int(source.lengths.sum()), f"{rate:,.0f} pairs/s")
-        spent = stopwatch.spent()
-        writer.made = {
-            "reset_error": reset_error,
-            **spent,
-            "pairs_per_second": steps / spent["wall_seconds"],
-            "simulated_pairs_per_second": steps / simulating,
-        }
+        writer.made = {"reset_error": reset_error, **stopwatch.spent()}
     units = list(pairing.abstract_state.units)
     for entry, unit in enumerate(units):
         if unit in ("", "1") and is_angle(_name(pairing, entry)):

@@ -1,22 +1,18 @@
 """Report: the results of all methods and seeds of a recipe, as results.json, .md, .html and figures."""
 
-import json
 import logging
 from collections.abc import Sequence
-from dataclasses import asdict, replace
-from hashlib import sha256
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
 from pydantic import Field, field_validator
 
-from astra_data.core.artifact import finished_folder, read_manifest
+from astra_data.core.artifact import finished_folder
 from astra_data.core.config import Config, Share, as_fault
 from astra_data.core.durable import file_digest, write_file
-from astra_data.core.errors import BadInputError
 from astra_data.core.naming import artifact_key
 from astra_data.core.progress import Progress, silent
-from astra_data.core.provenance import origin
 from astra_data.methods import method_named
 from astra_data.reports.artifacts import EVALUATION
 from astra_data.reports.blocks import html, markdown
@@ -69,7 +65,6 @@ def report(
     for row in (*config.trajectory_methods, *config.paper_success, *config.compare):
         method_named(row)
     task = task_named(recipe.task)
-    made_from = _digests(recipe, root, command, config)
     found = read_run(
         replace(recipe, task=task.name),  # not where its file is
         root=root,
@@ -86,7 +81,7 @@ def report(
     images = drawn(found, scene)
     progress(0.9, f"{len(images)} figures")
     sections = sections_of(found, f"runs/{root.name}" if root.is_absolute() else str(root))  # as commands name it
-    with finished_folder(root / "report", replace=True, made_from=made_from) as folder:
+    with finished_folder(root / "report", replace=True, made_from=_digests(recipe, root)) as folder:
         write_file(folder / JSON, results_json(found))
         write_file(folder / PAGE, markdown(found.recipe, sections, {name: f"{name}.png" for name in images}))
         write_file(folder / HTML, html(found.recipe, sections, images))
@@ -112,21 +107,8 @@ def _added_to(published: Sequence[Path], found: Results) -> Results:
     return merge([*earlier, found]) if earlier else found
 
 
-def is_current(recipe: Reported, *, root: Path, command: str, config: ReportConfig, **_: object) -> bool:
-    """Return whether the report at `root` was made of what is there now, and as it would be now."""
-    try:
-        manifest = read_manifest(root / "report")
-    except BadInputError:
-        return False
-    if manifest is None or manifest.faults(root / "report", verify=False):
-        return False
-    return manifest.made_from == _digests(recipe, root, command, config)
-
-
-def _digests(recipe: Reported, root: Path, command: str, config: ReportConfig) -> dict[str, str]:
+def _digests(recipe: Reported, root: Path) -> dict[str, str]:
     points = product(recipe.methods, recipe.percents or (None,), recipe.seeds)
     keys = [artifact_key("evaluate", row, seed, percent) for row, percent, seed in points]
     read = {key: root / key / EVALUATION for key in keys} | {FOLDER: root / FOLDER / SELECTED}
-    settings = json.dumps([asdict(recipe), command, config.model_dump(), origin()], sort_keys=True, default=str)
-    digests = {key: file_digest(file) for key, file in read.items() if file.exists()}
-    return digests | {"settings": sha256(settings.encode()).hexdigest()}
+    return {key: file_digest(file) for key, file in read.items() if file.exists()}

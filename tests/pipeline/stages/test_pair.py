@@ -54,9 +54,6 @@ def test_all_else_stays_and_the_parent_is_recorded(collected: Path, paired: Path
         "radius_m": 0.1,
         "speed_m_s": 1.0,
     }
-    steps = after.description["pairs_per_second"] * after.description["wall_seconds"]
-    assert steps == pytest.approx(after.lengths.sum())
-    assert after.description["simulated_pairs_per_second"] > after.description["pairs_per_second"]
     assert after.description["machine"] == before.description["machine"] and after.order == before.order
     assert after.metadata == before.metadata
     for one, other in zip(before.episodes(), after.episodes(), strict=True):

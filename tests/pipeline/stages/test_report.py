@@ -4,11 +4,9 @@ import logging
 import shutil
 from base64 import b64decode
 from collections.abc import Iterator
-from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 from fake_dataset import write_fake
@@ -33,7 +31,7 @@ from astra_data.core.durable import file_digest
 from astra_data.core.errors import BadInputError, MissingStageError
 from astra_data.core.naming import artifact_key
 from astra_data.pipeline.stages import report as stage
-from astra_data.pipeline.stages.report import is_current, report
+from astra_data.pipeline.stages.report import report
 from astra_data.reports.figures import catalog as figures
 from astra_data.reports.results import read_results
 from astra_data.worlds.objective import RETURN, SURVIVED_STEPS
@@ -99,22 +97,6 @@ def test_the_table_of_methods_has_the_targets_column_first(target: str) -> None:
     assert (astra["lost"], astra["failed"], astra["seeds"]) == ("0.25", "0.50 ± 0.25", "3")
     assert plus["path length to success (m)"] == "8.0 ± 0.0"
     assert table["Careful follower (ceiling)"]["in its simulator"] == "-" and "Direct transfer (floor)" in table
-
-
-def test_a_finished_report_is_current_until_something_changes(root: Path) -> None:
-    make(root)
-    asked: dict[str, Any] = {"root": root, "command": COMMAND, "config": CONFIG}
-    assert is_current(FakeRecipe(), **asked, publish=None)
-    assert not is_current(replace(FakeRecipe(), seeds=(0, 1)), **asked)
-    assert not is_current(FakeRecipe(), **asked | {"config": CONFIG.model_copy(update={"trajectory_episodes": 3})})
-    path = root / "evaluate/astra/seed_0/evaluation.json"
-    before = path.read_text()
-    edit_json(path, wall_seconds=11.0)
-    assert not is_current(FakeRecipe(), **asked)
-    path.write_text(before)
-    assert is_current(FakeRecipe(), **asked)
-    (root / "report/results.html").unlink()
-    assert not is_current(FakeRecipe(), **asked)
 
 
 @pytest.mark.parametrize("changed", [{"paper_success": {"astar": 0.4}}, {"compare": ("astar",)}])
