@@ -12,10 +12,9 @@ from array import array
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from io import SEEK_END, BytesIO
+from io import SEEK_END
 from mmap import ACCESS_READ, mmap
 from typing import IO, Any
-from zlib import crc32
 
 import numpy as np
 
@@ -27,7 +26,6 @@ from astra_data.io.recording import MOST_UNPACKED, VALUE_BYTES, Block, Source
 from astra_data.io.resampling import Resampler
 
 MAGIC = b"\x89MCAP0\r\n"
-_HEAD = struct.Struct("<BQ")  # of a record: its kind and its length
 _BLOCK_BYTES = 2**16
 FEWEST = 10  # messages to a step back of the clock
 
@@ -36,18 +34,25 @@ class McapFile:
     """The messages of some topics of an MCAP file, in its order."""
 
     def __init__(self, source: Source, topics: Collection[str]) -> None:
-        """Look at both ends of the file, and read its index if it has one."""
-        self.is_cut = False  # whether messages may be missing at its end; known once it was read
+        """Look at both ends of the file, and at its index if it has one."""
         self.streams: dict[str, Callable[[Any], list[str]]] = {}
         """Topic to what gives the names under which one of its messages is yielded, by default its own."""
         self._decoders: dict[int, Callable[[bytes], Any]] = {}
         self._source, self._wanted = source, topics
         self._channels: dict[int, Any] = {}
         self._schemas: dict[int, Any] = {}
-        self._chunks: list[Any] | None = None
-        self._whole_bytes: int | None = None
-        self._left = 0
-        self._open()
+        with source.open() as stream:
+            size, self._content_bytes = stream.seek(0, SEEK_END), _content_bytes(stream)
+            if not self._content_bytes:
+                raise BadInputError(f"{source} is empty: nothing was recorded, leave it out")
+            stream.seek(max(size - len(MAGIC), 0))
+            self.is_cut = size < 2 * len(MAGIC) or stream.read() != MAGIC  # messages may be missing at its end
+            stream.seek(0)
+            summary = None if self.is_cut else optional("mcap.reader").make_reader(stream).get_summary()
+        # An index may leave out what the data say.
+        if summary and summary.statistics and summary.statistics.channel_count == len(summary.channels):
+            self._channels = dict(summary.channels)
+            self.check_topics()
 
     def messages(self) -> Iterator[tuple[str, Any]]:
         """Yield each message with its topic, in the order of the file."""
@@ -94,87 +99,29 @@ class McapFile:
         expected = "expected json, protobuf, or cdr with ros2msg schema"
         raise BadInputError(f"{self._source}: messages of {channel.topic} are {encoding}, {expected}")
 
-    def _open(self) -> None:
-        with self._source.open() as stream:
-            size, content = stream.seek(0, SEEK_END), _content_bytes(stream)
-            if not content:
-                raise BadInputError(f"{self._source} is empty: nothing was recorded, leave it out")
-            stream.seek(max(size - len(MAGIC), 0))
-            if size < 2 * len(MAGIC) or stream.read() != MAGIC:
-                self._whole_bytes, self.is_cut = _whole_bytes(stream, content), True
-                return
-            stream.seek(0)
-            summary = optional("mcap.reader").make_reader(stream).get_summary()
-        if summary is None:
-            return
-        self._channels, self._schemas = dict(summary.channels), dict(summary.schemas)
-        used = set().union(*(index.message_index_offsets for index in summary.chunk_indexes))
-        described = {channel.schema_id for channel in summary.channels.values()} - {0}
-        # A summary may leave out what the data say.
-        if summary.chunk_indexes and used <= summary.channels.keys() and described <= summary.schemas.keys():
-            indexes = sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset)
-            wanted = {number for number, channel in self._channels.items() if channel.topic in self._wanted}
-            # Some chunks list no channels.
-            self._chunks = [index for index in indexes if not (of := index.message_index_offsets) or wanted & of.keys()]
-            self.check_topics()
-
     def _records(self) -> Iterator[Any]:
-        """Yield the records of the data, those of chunks unpacked."""
+        """Yield the records of the data, those of chunks unpacked, up to where the file is cut off."""
         reading, records = optional("mcap.stream_reader"), optional("mcap.records")
-        with self._source.open() as stream:
-            self._left = self._source.most_unpacked
-            if self._chunks is not None:
-                for index in self._chunks:
-                    stream.seek(index.chunk_start_offset + _HEAD.size)
-                    yield from self._unpacked(records.Chunk.read(reading.ReadDataStream(stream)))
-                return
-            whole: Any = stream
-            if self._whole_bytes is not None:  # 0 would be the whole file
-                whole = mmap(stream.fileno(), self._whole_bytes, access=ACCESS_READ) if self._whole_bytes else BytesIO()
+        left = self._source.most_unpacked
+        with self._source.open() as file, mmap(file.fileno(), self._content_bytes, access=ACCESS_READ) as stream:
             try:
-                for record in reading.StreamReader(whole, emit_chunks=True, validate_crcs=True).records:
-                    if isinstance(record, records.Chunk):
-                        yield from self._unpacked(record)
-                    elif isinstance(record, records.DataEnd):
+                for record in reading.StreamReader(stream, emit_chunks=True, validate_crcs=True).records:
+                    if isinstance(record, records.DataEnd):
                         self.is_cut = False
                         return
-                    else:
+                    if not isinstance(record, records.Chunk):
                         yield record
-            except optional("mcap.exceptions").EndOfFile:
-                if self._whole_bytes is None:
+                        continue
+                    left -= record.uncompressed_size
+                    if left < 0:
+                        raise BadInputError(
+                            f"{self._source}: its chunks are more than {MOST_UNPACKED} times as large as the file "
+                            "once unpacked: if you trust it, pass a larger --max-bytes"
+                        )
+                    yield from reading.breakup_chunk(record, validate_crc=True)
+            except (optional("mcap.exceptions").EndOfFile, struct.error):
+                if not self.is_cut:
                     raise
-
-    def _unpacked(self, chunk: Any) -> Iterator[Any]:
-        """Yield the records of a chunk, unpacked only as far as its header says and the limit allows."""
-        reading, records = optional("mcap.stream_reader"), optional("mcap.records")
-        if chunk.uncompressed_size > self._left:
-            raise BadInputError(
-                f"{self._source}: its chunks are more than {MOST_UNPACKED} times as large as the file once "
-                "unpacked: if you trust it, pass a larger --max-bytes"
-            )
-        self._left -= chunk.uncompressed_size
-        most = chunk.uncompressed_size + 1
-        data: bytes = chunk.data
-        if chunk.compression == "zstd":
-            packed = optional("zstandard").ZstdDecompressor().stream_reader(data, read_across_frames=True)
-            data = packed.read(most)
-        elif chunk.compression == "lz4":
-            data = optional("lz4.frame").LZ4FrameDecompressor().decompress(data, max_length=most)
-        elif chunk.compression:
-            raise BadInputError(f"{self._source}: chunks packed as {chunk.compression}, expected zstd or lz4")
-        if len(data) != chunk.uncompressed_size:
-            raise BadInputError(f"{self._source}: a chunk has another size than its header says: it is damaged")
-        if chunk.uncompressed_crc and crc32(data) != chunk.uncompressed_crc:
-            raise BadInputError(f"{self._source}: a chunk has another checksum than was written: it is damaged")
-        stream, kinds = reading.ReadDataStream(BytesIO(data)), optional("mcap.opcode").Opcode
-        while stream.count < len(data):
-            kind, length = stream.read1(), stream.read8()
-            if kind == kinds.MESSAGE:
-                yield records.Message.read(stream, length)
-            elif kind in (kinds.CHANNEL, kinds.SCHEMA):
-                yield (records.Channel if kind == kinds.CHANNEL else records.Schema).read(stream)
-            else:
-                stream.read(length)
 
 
 def _content_bytes(stream: IO[bytes]) -> int:
@@ -187,22 +134,6 @@ def _content_bytes(stream: IO[bytes]) -> int:
             return begin + len(content)
         end = begin
     return 0
-
-
-def _whole_bytes(stream: IO[bytes], content: int) -> int:
-    """Return up to where the records of a file with `content` bytes before zeros are whole."""
-    size = stream.seek(0, SEEK_END)
-    end = len(MAGIC) if size >= len(MAGIC) else 0
-    while True:
-        stream.seek(end)
-        head = stream.read(_HEAD.size)
-        if len(head) < _HEAD.size:
-            return end
-        after = end + _HEAD.size + _HEAD.unpack(head)[1]
-        # Without zeros at the end, a record may well end in some of its own.
-        if after > content and after != size:
-            return end
-        end = after
 
 
 class Timeline:

@@ -1,12 +1,10 @@
 import re
-import struct
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from mcap_recordings import Message, command, ns, pose, write_json
 
@@ -45,10 +43,7 @@ WANTED = [number for number in range(LENGTH) if number % 5 and not 100 < number 
 FORMS: dict[str, dict[str, Any]] = {"usual": {}, "without chunks": {"use_chunking": False}}
 
 
-PACKED = [CompressionType.ZSTD, CompressionType.LZ4]
-
-
-@pytest.mark.parametrize("compression", PACKED)
+@pytest.mark.parametrize("compression", [CompressionType.ZSTD, CompressionType.LZ4])
 def test_no_more_is_unpacked_than_the_limit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compression: CompressionType
 ) -> None:
@@ -65,32 +60,10 @@ def test_no_more_is_unpacked_than_the_limit(
             list(file.messages())
 
 
-@pytest.mark.parametrize("compression", PACKED)
-@pytest.mark.parametrize("declared", [0, 100, 10**6])
-def test_a_chunk_is_unpacked_as_far_as_it_says(tmp_path: Path, compression: CompressionType, declared: int) -> None:
-    path = write(tmp_path / "log.mcap", compression=compression)
-    with path.open("rb") as file:
-        summary = make_reader(file).get_summary()
-    assert summary is not None
-    content = bytearray(path.read_bytes())
-    start = summary.chunk_indexes[0].chunk_start_offset + 9 + 16
-    content[start : start + 8] = struct.pack("<Q", declared)
-    path.write_bytes(content)
-    with pytest.raises(BadInputError, match="has another size than its header says"):
-        numbers(path)
-
-
-def test_chunks_without_wanted_messages_are_not_read(tmp_path: Path) -> None:
-    path = write(tmp_path / "log.mcap", compression=CompressionType.NONE)
-    content = bytearray(path.read_bytes())
-    for number in (150, 250):
-        place = content.index(b"%03d" % number + bytes(20))
-        content[place] ^= 1
-        path.write_bytes(content)
-        if number == 150:
-            assert numbers(path) == (WANTED, False)
-    with pytest.raises(BadInputError, match="has another checksum than was written"):
-        numbers(path)
+def test_the_index_tells_of_missing_topics_before_anything_is_read(tmp_path: Path) -> None:
+    path = write(tmp_path / "log.mcap")
+    with pytest.raises(BadInputError, match=r"^log\.mcap: no topic '/use': did you mean '/used'\?$"):
+        McapFile(Source(path, None, path), ["/use"])
 
 
 @pytest.mark.parametrize("form", ["usual", "without chunks"])
@@ -122,7 +95,7 @@ def test_damage_before_a_cut_is_refused(tmp_path: Path) -> None:
     content = bytearray(path.read_bytes())
     content[content.index(b"050" + bytes(20))] ^= 1
     path.write_bytes(content[: 3 * len(content) // 4])
-    with pytest.raises(BadInputError, match="has another checksum than was written"):
+    with pytest.raises(ValueError, match="crc validation failed in Chunk"):
         numbers(path)
 
 
