@@ -80,14 +80,6 @@ class HistoryFit:
     """Whether R_pred learns the whole reward, failures included, as the paper prints it. By default it learns
     the residual reward: the target's less the task's own on the recorded abstract states."""
 
-    def weights(self, config: GroundConfig) -> "LossWeights":
-        """Return the weights of the losses."""
-        from astra_data.grounding.model import LossWeights
-
-        return LossWeights(
-            latent=config.latent_weight if self.latent else 0.0, reward=config.reward_weight if self.reward else 0.0
-        )
-
     def __call__(self, fitting: Fitting) -> "tuple[HistoryGrounding, dict[str, Any]]":
         """Return the grounding and its figures."""
         from astra_data.grounding.failures import failure_figures, fit_failures, has_failures
@@ -127,15 +119,15 @@ class HistoryFit:
 
     def _fitted(self, fitting: Fitting, *, corrects_reward: bool) -> "tuple[GroundingModel, dict[str, Any]]":
         from astra_data.grounding.encoder import HistoryEncoder, take_scales
-        from astra_data.grounding.model import GroundingModel, GroundingShape, recorded_rewards
+        from astra_data.grounding.model import GroundingModel, GroundingShape, LossWeights, recorded_rewards
 
-        training, windows = fitting.training, fitting.training.windows
+        config, training, windows = fitting.config, fitting.training, fitting.training.windows
         torch.manual_seed(derive(fitting.seed, "grounding"))
         shape = GroundingShape(
             state_size=windows.state.shape[-1],
             action_size=windows.action.shape[-1],
             goal_size=windows.goal.shape[-1],
-            latent_size=fitting.config.latent_size,
+            latent_size=config.latent_size,
             position_octaves=_POSITION_OCTAVES if fitting.task.plane else 0,
             ball_index=fitting.task.ball_index,
             corrects_reward=corrects_reward,
@@ -147,7 +139,8 @@ class HistoryFit:
         take_scales(model, {name: training.steps(values) for name, values in columns.items()})
         rewards = recorded_rewards(windows)
         model.set_reward_scales(*map(training.steps, (rewards, windows.goes_on, windows.failed)))
-        return model, _optimize(model, self.weights(fitting.config), fitting)
+        weights = LossWeights(config.latent_weight * self.latent, config.reward_weight * self.reward)
+        return model, _optimize(model, weights, fitting)
 
     def _rewarded(self, task: Task, episodes: PairedEpisodes, predicts_failures: bool) -> PairedEpisodes:
         """Return the episodes with the rewards that R_pred learns."""

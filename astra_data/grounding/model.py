@@ -1,4 +1,4 @@
-"""ASTRA's grounding model and its joint loss (paper, Section IV-A); with weights (0, 0, 1) it is the paper's NAS."""
+"""ASTRA's grounding model and its joint loss (paper, Section IV-A); with weights (0, 0) it is the paper's NAS."""
 
 import copy
 from dataclasses import dataclass
@@ -17,11 +17,10 @@ _EMA_RATE = 0.01  # by how much the target encoder follows the encoder in each u
 
 @dataclass(frozen=True)
 class LossWeights:
-    """λ1, λ2, λ3 of the paper's total loss."""
+    """λ1 and λ2 of the paper's total loss; λ3, the weight of the correction, is 1."""
 
     latent: float = 0.1
     reward: float = 1.0
-    state: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -126,17 +125,13 @@ class GroundingModel(nn.Module):
 
     def target_reward(self, latent: Tensor, action: Tensor, own: Tensor, hazard: Tensor | None = None) -> Tensor:
         """Return the target's reward (...), given the task's `own`, less what a `hazard` (...) of failure costs."""
-        predicted = self.predict_reward(latent, action)
+        predicted = self.rewards(latent, action)[..., -1] * self.reward_shrinkage
         if self.shape.corrects_reward:
             predicted = predicted + own
         return predicted if hazard is None else predicted + hazard * self.failure_cost
 
-    def predict_reward(self, latent: Tensor, action: Tensor) -> Tensor:
-        """R_pred: return the target's reward (...), or the residual reward if it predicts that."""
-        return self.rewards(latent, action)[..., -1] * self.reward_shrinkage
-
     def rewards(self, latent: Tensor, action: Tensor) -> Tensor:
-        """Return the predicted rewards (..., R), see `set_reward_scales`."""
+        """R_pred: return the predicted rewards (..., R), see `set_reward_scales`."""
         normal: Tensor = self.reward_head(torch.cat([latent, action], dim=-1))
         return normal * self.reward_std + self.reward_mean
 
@@ -190,8 +185,7 @@ class GroundingModel(nn.Module):
         corrected = self.correct(latent, action, windows.simulated_next)
         error = ((corrected - windows.next_state) / self.correction_std)[..., : self.corrected_size].square().mean(-1)
         parts["state"] = _masked_mean(error, mask)
-        total = total + weights.state * parts["state"]
-        return total, parts
+        return total + parts["state"], parts
 
     @torch.no_grad()
     def _following_latent(self, inputs: Tensor) -> Tensor:

@@ -103,11 +103,12 @@ def test_scales_and_sizes_are_of_the_training_episodes(tmp_path: Path) -> None:
     loss, _ = model.losses(with_own_rewards(TASK, fitting.held_out).windows, LossWeights(latent=0.0))
     assert metrics["epochs"][0]["held_out_error"] == pytest.approx(float(loss.detach()))
     assert replace(fitting, config=GroundConfig(batch_windows=1, window=1)).descent.updates == 32 * 36
-    assert HistoryFit(latent=False, reward=False).weights(fitting.config) == LossWeights(0.0, 0.0)
     of = HistoryFit(latent=False, reward=False, failures=False, scatter=False)
     placeless = replace(TASK, plane=None, quantities={"ball_position_m": (2, 3)})
-    shape = fit(tmp_path / "placeless", of, task=placeless)[0].model.shape
+    grounding, metrics, _ = fit(tmp_path / "placeless", of, task=placeless)
+    shape = grounding.model.shape
     assert (shape.position_octaves, shape.ball_index) == (0, 2)
+    assert [name for name in metrics["epochs"][0] if name.startswith("loss_")] == ["loss_state"]
 
 
 def test_all_that_is_drawn_comes_from_the_seed(tmp_path: Path) -> None:
@@ -160,12 +161,14 @@ def test_it_returns_to_the_weights_with_the_least_held_out_error(
     seen, errors = list[dict[str, torch.Tensor]](), iter([2.0, 1.0, 3.0, 1.5, 4.0])
 
     def measured(model: GroundingModel, held_out: PairedEpisodes, weights: LossWeights) -> float:
+        assert weights == LossWeights(latent=0.2, reward=0.3)
         seen.append({name: values.clone() for name, values in model.state_dict().items()})
         return next(errors)
 
     monkeypatch.setattr(fit_module, "_MEASURED_EVERY", 1)
     monkeypatch.setattr(fit_module, "_held_out_error", measured)
-    grounding, metrics, _ = fit(tmp_path, HistoryFit(latent=True, reward=True, printed=True), updates=5)
+    of = HistoryFit(latent=True, reward=True, printed=True)
+    grounding, metrics, _ = fit(tmp_path, of, updates=5, latent_weight=0.2, reward_weight=0.3)
     assert metrics["updates"] == 2 and len(seen) == 4  # three tenths of five updates are awaited
     kept = grounding.model.state_dict()
     assert all(torch.equal(kept[name], values) for name, values in seen[1].items())

@@ -139,7 +139,7 @@ def test_a_failure_model_is_asked_before_each_correction_and_prices_failures(lat
         said = failures.probability(seen)
         torch.testing.assert_close(one.step(action), plain.step(action))
         torch.testing.assert_close(one.failure_risk(), said / 2)  # within two steps
-        expected = used.predict_reward(latent, action) - 10.0 * said / 2
+        expected = used.target_reward(latent, action, torch.zeros(3)) - 10.0 * said / 2
         torch.testing.assert_close(one.predicted_reward(torch.zeros(3)), expected)
 
 

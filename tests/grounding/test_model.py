@@ -12,7 +12,6 @@ from astra_data.grounding.encoder import take_scales
 from astra_data.grounding.model import GroundingModel, GroundingShape, LossWeights, correction_r2, telemetry
 from astra_data.grounding.paired_episodes import PairedEpisodes, PairedWindows
 
-LATENT_ALONE = LossWeights(latent=1.0, reward=0.0, state=0.0)
 SIZE = 16
 
 
@@ -62,18 +61,20 @@ def untrained() -> GroundingModel:
     return model
 
 
-def fit(model: GroundingModel, weights: LossWeights, updates: int = 130) -> float:
-    """Train `model` and return the last loss of the latent, if it has one."""
-    optimizer = torch.optim.Adam([p for p in model.parameters() if p.requires_grad], lr=3e-3)
-    parts: dict[str, Tensor] = {}
+WEIGHTS = LossWeights()
+
+
+def fit(model: GroundingModel, updates: int = 130) -> float:
+    """Train `model` by the loss of the latent alone, and return the last one."""
+    optimizer, loss = torch.optim.Adam([p for p in model.parameters() if p.requires_grad], lr=3e-3), torch.zeros(())
     for _ in range(updates):
-        loss, parts = model.losses(TRAINING, weights)
+        loss = model.losses(TRAINING, WEIGHTS)[1]["latent"]
         optimizer.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
         optimizer.step()
         model.update_target()
-    return float(parts.get("latent", torch.zeros(())).detach())
+    return float(loss.detach())
 
 
 @torch.no_grad()
@@ -96,11 +97,10 @@ def test_the_latents_loss_does_not_collapse_them(monkeypatch: pytest.MonkeyPatch
     lowest = 0.5 * GroundingShape(2, 2, 2).log_variance_bounds[0]
     slow, online = untrained(), untrained()
     monkeypatch.setattr(online, "_following_latent", lambda inputs: online.encoder.sequence(inputs)[0][:, 1:])
-    assert fit(online, LATENT_ALONE) == pytest.approx(lowest, abs=0.1) and fit(slow, LATENT_ALONE) > lowest + 0.2
+    assert fit(online) == pytest.approx(lowest, abs=0.1) and fit(slow) > lowest + 0.2
     assert spread(online) < 0.05 < 0.4 < spread(slow)
 
 
-NOTHING = LossWeights(latent=0.0, reward=0.0, state=0.0)
 EPISODES, STEPS = 3, 7
 
 
@@ -199,7 +199,6 @@ def test_rewards_are_predicted_in_the_units_of_the_data(corrects_reward: bool) -
     output = used.reward_head(torch.cat([latent, action], dim=-1))[:, -1]
     used.reward_shrinkage.fill_(0.3)
     predicted = 0.3 * (output * used.reward_std[-1] + used.reward_mean[-1])
-    torch.testing.assert_close(used.predict_reward(latent, action), predicted)
     own, hazard = torch.randn(5), torch.rand(5)
     expected = predicted + own if corrects_reward else predicted
     torch.testing.assert_close(used.target_reward(latent, action, own), expected)
@@ -241,7 +240,7 @@ def test_the_loss_of_the_correction_is_its_squared_error_in_units_of_the_data() 
     used, given = model(), windows()
     corrected = used.correct(latents_of(used), given.action, given.simulated_next)
     error = ((corrected - given.next_state) / used.correction_std).square().mean(-1)
-    _, parts = used.losses(given, NOTHING)
+    _, parts = used.losses(given, WEIGHTS)
     torch.testing.assert_close(parts["state"], real(error))
 
 
@@ -272,7 +271,7 @@ def test_the_latent_loss_follows_the_slow_encoder() -> None:
     mean, log_variance = used.predict_latent(latents_of(used)[:, :-1], given.action[:, :-1])
     likelihood = torch.distributions.Normal(mean, (0.5 * log_variance).exp()).log_prob(slow[:, 1:]).mean(-1)
     both = (given.mask[:, :-1] * given.mask[:, 1:]).bool()
-    _, parts = used.losses(given, LossWeights())
+    _, parts = used.losses(given, WEIGHTS)
     expected = -likelihood[both].mean() - 0.5 * math.log(2 * math.pi)
     torch.testing.assert_close(parts["latent"], expected)
     before = [parameter.clone() for parameter in used.target_encoder.parameters()]
@@ -287,12 +286,9 @@ def test_the_target_of_the_latent_loss_gives_no_gradient() -> None:
     for parameter in used.latent_dynamics.parameters():  # predictions without a gradient to the latents
         parameter.data.zero_()
     assert (used.predict_latent(torch.zeros(3, 8), torch.zeros(3, 2))[1] == -2.0).all()  # midway of the bounds
-    used.losses(given, replace(NOTHING, latent=1.0))[0].backward()
+    used.losses(given, WEIGHTS)[1]["latent"].backward()
     gradient = next(used.encoder.parameters()).grad
     assert gradient is None or not gradient.any()
-
-
-WEIGHTS = LossWeights()
 
 
 def episodes() -> PairedEpisodes:
@@ -345,7 +341,7 @@ def test_shares_of_variance_are_those_of_real_steps() -> None:
     used, windows, real = model_of(given), given.windows, given.windows.mask.bool()
     figures = telemetry(used, given, WEIGHTS)
     latent, _ = used.encode(windows)
-    predicted, reward = used.predict_reward(latent, windows.action), windows.reward
+    predicted, reward = used.target_reward(latent, windows.action, torch.zeros(())), windows.reward
     paid = real & (reward > -5.0) & (reward < 40.0)
     assert int(real.sum() - paid.sum()) == 3
     assert figures["r2_reward"] == pytest.approx(r2(predicted[paid], reward[paid]), rel=1e-4)

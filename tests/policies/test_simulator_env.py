@@ -135,7 +135,7 @@ def test_predicted_rewards_leave_to_the_task_what_the_simulated_state_shows() ->
     action = torch.zeros(3, 3)
     step = one.step(action)
     own = task.objective.reward(state, one.simulator.state, goal, torch.tensor([False, False, True]))
-    predicted = model.predict_reward(latent, action).detach()
+    predicted = model.target_reward(latent, action, own).detach()
     assert step.terminated.tolist() == [False, True, True]
     torch.testing.assert_close(step.reward, torch.cat([predicted[:1], own[1:]]))
     assert float(own[1]) > 9.0 and float(own[2]) < -9.0 and float(predicted[0]) != pytest.approx(float(own[0]))
