@@ -58,10 +58,6 @@ class Wide(Glider):
         return state[:, :3]
 
 
-class Half:
-    abstract_state = "x"
-
-
 class Clumsy(Glider):
     def __init__(self) -> None:
         super().__init__(1)

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
 from astra_data.core.arrays import normalized
+from astra_data.core.lazy import scipy
 from astra_data.core.seeding import derive
 from astra_data.grounding.descent import Descent, DescentConfig, seeded
 from astra_data.grounding.encoder import Members, take_scales
@@ -316,15 +316,6 @@ def averages_before(task: Task, grounding: Grounding, failures: FailureModel, ep
     return functional.pad(after[:, :-1], (0, 0, 1, 0))
 
 
-@torch.no_grad()
-def failure_figures(
-    task: Task, grounding: Grounding, failures: FailureModel, held_out: PairedEpisodes
-) -> dict[str, Any]:
-    """Return the `failure_skill` of a failure model on replays of held-out episodes."""
-    probability = failures.probability(replayed_inputs(task, grounding, failures, held_out))
-    return failure_skill(probability, failing(task, held_out, failures.shape.risk_steps))
-
-
 def failure_skill(probability: Tensor, episodes: PairedEpisodes) -> dict[str, Any]:
     """Measure probabilities (E, T) of `fails_soon`: AUC by window ahead, Brier skill, reliability by bin."""
     windows = episodes.windows
@@ -335,11 +326,14 @@ def failure_skill(probability: Tensor, episodes: PairedEpisodes) -> dict[str, An
         return {"failures": 0, "auc": None, "brier_skill": None, "reliability": None}
     calm = AHEAD_STEPS[-1][1] + mask.shape[1]  # no failure comes, however short the episode is
     left = torch.where(fails.any(1, keepdim=True), mask.flip(1).cumsum(1).flip(1), calm)
-    safe = probability[mask & (left > AHEAD_STEPS[-1][1])].numpy(force=True)
+    safe = probability[mask & (left > AHEAD_STEPS[-1][1])].double().numpy(force=True)
     auc: dict[str, float | None] = {}
     for first, last in AHEAD_STEPS:
-        before = probability[mask & (left >= first) & (left <= last)].numpy(force=True)
-        auc[f"{first}-{last}"] = ranked_above(before, safe)
+        before = probability[mask & (left >= first) & (left <= last)].double().numpy(force=True)
+        auc[f"{first}-{last}"] = None
+        if pairs := len(before) * len(safe):
+            above = scipy.stats.mannwhitneyu(before, safe, method="asymptotic").statistic
+            auc[f"{first}-{last}"] = float(above) / pairs
     predicted, happened = probability[mask].numpy(force=True), fails[mask].numpy(force=True)
     usual = np.square(happened - happened.mean()).mean()
     bins = np.digitize(predicted, BINS[1:-1])
@@ -352,10 +346,3 @@ def failure_skill(probability: Tensor, episodes: PairedEpisodes) -> dict[str, An
             for one in np.unique(bins)
         ],
     }
-
-
-def ranked_above(before: NDArray[Any], safe: NDArray[Any]) -> float | None:
-    """Return the AUC: how probably one of `before` (N,) is above one of `safe` (M,); None without either."""
-    pairs, ordered = len(before) * len(safe), np.sort(safe)
-    below, up_to = (np.searchsorted(ordered, before, side=side).sum() for side in ("left", "right"))
-    return float((below + up_to) / 2 / pairs) if pairs else None

@@ -82,7 +82,7 @@ class HistoryFit:
 
     def __call__(self, fitting: Fitting) -> "tuple[HistoryGrounding, dict[str, Any]]":
         """Return the grounding and its figures."""
-        from astra_data.grounding.failures import failure_figures, fit_failures, has_failures
+        from astra_data.grounding.failures import failing, failure_skill, fit_failures, has_failures, replayed_inputs
         from astra_data.grounding.history import HistoryGrounding, fit_hits, fit_scatter
 
         task = fitting.task
@@ -113,7 +113,8 @@ class HistoryFit:
             grounding = replace(grounding, scatter_model=scatter_model)
         if predicts_failures:
             failures, metrics["failure_model"] = fit_failures(task, grounding, training, fitting.seed)
-            metrics["failures"] = {"failure_model": failure_figures(task, grounding, failures, held_out)}
+            probability = failures.probability(replayed_inputs(task, grounding, failures, held_out))
+            metrics["failures"] = {"failure_model": failure_skill(probability, failing(task, held_out))}
             grounding = replace(grounding, failures=failures)
         return grounding, metrics | metrics.pop("stopwatch").spent()
 

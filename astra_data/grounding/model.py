@@ -17,7 +17,7 @@ _EMA_RATE = 0.01  # by how much the target encoder follows the encoder in each u
 
 @dataclass(frozen=True)
 class LossWeights:
-    """λ1 and λ2 of the paper's total loss; λ3, the weight of the correction, is 1."""
+    """The weights of the loss, λ1 and λ2 in the paper; λ3, that of the correction, is 1."""
 
     latent: float = 0.1
     reward: float = 1.0

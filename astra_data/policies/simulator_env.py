@@ -102,21 +102,16 @@ class SimulatorEnv:
         """Start an episode in each row, from states (B, X) with goals (B, G)."""
         self._start(state, goal, torch.arange(self.num_envs, device=self.device))
 
-    def _start(self, state: Tensor, goal: Tensor, rows: Tensor) -> None:
-        self.goal[rows], self._command[rows] = goal, 0.0
-        self.simulator.start(state, rows, goal)
-
     def _start_from_data(self, rows: Tensor, starts: DataStarts) -> None:
         moments = torch.randint(len(starts.state), (len(rows),), device=self.device)
-        self.goal[rows] = starts.goal[moments]
-        self._command[rows] = starts.previous_action[moments]
-        self.simulator.start(
-            starts.state[moments],
-            rows,
-            starts.goal[moments],
-            hidden=None if starts.hidden is None else starts.hidden[moments],
-            previous_action=starts.previous_action[moments],
-        )
+        hidden = None if starts.hidden is None else starts.hidden[moments]
+        self._start(starts.state[moments], starts.goal[moments], rows, hidden, starts.previous_action[moments])
+
+    def _start(
+        self, state: Tensor, goal: Tensor, rows: Tensor, hidden: Tensor | None = None, action: Tensor | None = None
+    ) -> None:
+        self.goal[rows], self._command[rows] = goal, 0.0 if action is None else action
+        self.simulator.start(state, rows, goal, hidden=hidden, previous_action=action)
 
     def _tensor(self, values: Floats) -> Tensor:
         return torch.from_numpy(values).float().to(self.device)

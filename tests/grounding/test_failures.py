@@ -23,7 +23,6 @@ from astra_data.grounding.failures import (
     averages_before,
     calibration,
     failing,
-    failure_figures,
     failure_skill,
     fit_failures,
     folds,
@@ -101,10 +100,10 @@ def test_failures_of_other_episodes_are_foreseen_as_often_as_they_come() -> None
     # A constant rate is far from knowing the moment.
     best = max(one["nats_per_failure"] for one in figures["candidates"])
     assert best > 1.0 and figures["latent"] == bool(made.shape.latent_size)
-    found = failure_figures(TASK, GROUNDING, made, fresh)
+    probability = made.probability(replayed_inputs(TASK, GROUNDING, made, fresh))
+    found = failure_skill(probability, failing(TASK, fresh))
     assert found["failures"] == 20 and found["auc"]["1-20"] > 0.9
-    seen = replayed_inputs(TASK, GROUNDING, made, fresh)
-    assert float(fresh.steps(made.hazard(made.probability(seen))).sum()) == pytest.approx(20, rel=0.35)
+    assert float(fresh.steps(made.hazard(probability)).sum()) == pytest.approx(20, rel=0.35)
     known = training.steps(replayed_inputs(TASK, GROUNDING, made, training))
     torch.testing.assert_close(made.input_mean, known.mean(0), atol=1e-5, rtol=1e-4)
 

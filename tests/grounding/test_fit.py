@@ -1,6 +1,7 @@
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
 import torch
@@ -236,13 +237,14 @@ def test_a_fit_takes_it_from_its_training_episodes_but_as_printed_and_where_touc
     task = replace(TASK, objective=replace(TASK.objective, ends_at_walls=at_walls))
     given, seen = list[float | None](), list[PairedEpisodes]()
 
-    def noted(task: Task, grounding: HistoryGrounding, *others: Any) -> tuple[None, None]:
+    def noted(task: Task, grounding: HistoryGrounding, *others: Any) -> tuple[MagicMock, None]:
         given.append(grounding.clearance_m)
         seen.extend(one for one in others if isinstance(one, PairedEpisodes))
-        return None, None
+        return MagicMock(), None
 
     monkeypatch.setattr("astra_data.grounding.failures.fit_failures", noted)
-    monkeypatch.setattr("astra_data.grounding.failures.failure_figures", noted)
+    monkeypatch.setattr("astra_data.grounding.failures.replayed_inputs", noted)
+    monkeypatch.setattr("astra_data.grounding.failures.failure_skill", lambda *_: None)
     monkeypatch.setattr("astra_data.grounding.failures.has_failures", lambda *_: True)
     training, held_out = recorded(*[1.0] * 10), recorded(*[0.5] * 10)
     config = GroundConfig(updates=1, batch_windows=1, window=2, latent_size=8)

@@ -150,7 +150,6 @@ def test_the_largest_reset_error_of_all_blocks_is_recorded(
         (f"{MINE}:Numeric", r"Numeric\(4096\).state: expected a torch tensor, got a ndarray"),
         (f"{MINE}:Relapsing", r"after reset_to, Relapsing.state: expected a torch tensor, got a ndarray"),
         (f"{MINE}:Wide", r"abstraction of Wide makes \(\d+, 3\) of states .* expected \(\d+, 2\)"),
-        (f"{MINE}:Half", r"Half has no abstraction, parameters, reset_to, step"),
         (f"{MINE}:Gilder", r"has no 'Gilder'; it has .*Glider"),
     ],
 )
