@@ -10,6 +10,6 @@ from astra_data.core.checkpoint import resumed, save_state
 def came_back(state: dict[str, Any]) -> dict[str, Any]:
     """Return what a training that resumes from `state` is given."""
     with TemporaryDirectory() as folder:
-        save_state(Path(folder) / "checkpoint.safetensors", state, {})
-        with resumed(Path(folder) / "checkpoint.safetensors") as (read, _):
+        save_state(Path(folder) / "checkpoint.pt", state, {})
+        with resumed(Path(folder) / "checkpoint.pt") as (read, _):
             return read

@@ -12,7 +12,7 @@ from typing import Any
 from astra_data.core import durable
 from astra_data.core.errors import BadInputError
 
-CHECKPOINT = "checkpoint.safetensors"  # name, or the end of it, of the file that a training goes on from
+CHECKPOINT = "checkpoint.pt"  # name, or the end of it, of the file that a training goes on from
 _SETTINGS = "config.json"  # name of the file of the settings in a folder
 MANIFEST = "manifest.json"
 GROWING = ("trials.csv", "trials.json", "select.md")  # what trials in the target change later: no manifest has it

@@ -1,10 +1,12 @@
-"""Weights and training states on disk, as safetensors and JSON: written atomically, never pickled."""
+"""Weights as safetensors, and training states as torch saves them, read without running code: written atomically."""
 
 import json
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
+from io import BytesIO
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any
 
 from safetensors import SafetensorError, safe_open
@@ -16,8 +18,6 @@ from astra_data.core.lazy import Tensor, torch
 from astra_data.core.naming import first_few
 from astra_data.core.progress import Stopwatch
 
-type Nested = Mapping[Any, "Nested"] | list["Nested"] | tuple["Nested", ...] | Tensor | bool | int | float | None
-"""A training state, such as an optimizer's `state_dict()`."""
 CHECKPOINT_SECONDS = 60.0
 
 
@@ -59,21 +59,22 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     return tensors, metadata
 
 
-def save_state(checkpoint: Path, state: Nested, metadata: Mapping[str, Any]) -> None:
-    """Write the state of a training and `metadata` (JSON values) to `checkpoint`, for `resumed`."""
-    tensors: dict[str, Tensor] = {}
-    save_tensors(checkpoint, tensors, {**metadata, "state": _to_json(state, tensors)})
+def save_state(checkpoint: Path, state: Mapping[str, Any], metadata: Mapping[str, Any]) -> None:
+    """Write the state of a training, tensors and numbers in containers, and `metadata` (JSON values), for `resumed`."""
+    data = BytesIO()
+    torch.save({"state": state, "metadata": json.dumps(metadata)}, data)
+    write_file(checkpoint, data.getvalue())
 
 
 @contextmanager
 def resumed(checkpoint: Path) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
     """Yield the state and the metadata that `save_state` wrote; the block resumes from them."""
     try:
-        tensors, metadata = load_tensors(checkpoint)
-    except BadInputError as error:
-        raise BadInputError(f"{error}: remove {checkpoint.parent}") from None
+        found = torch.load(checkpoint, map_location="cpu", weights_only=True)
+    except (EOFError, RuntimeError, UnpicklingError) as error:
+        raise BadInputError(f"{checkpoint} is not a complete checkpoint: remove {checkpoint.parent}") from error
     try:
-        yield _from_json(metadata["state"], tensors), metadata
+        yield found["state"], json.loads(found["metadata"])
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         expected = f"expected a checkpoint of this version, found something else ({error})"
         raise BadInputError(f"{checkpoint}: {expected}: remove {checkpoint.parent}") from error
@@ -122,37 +123,6 @@ def loaded[Module: torch.nn.Module](model: Module, weights: Mapping[str, Tensor]
     """Return `model` with these weights, on `device`, frozen and out of training."""
     model.load_state_dict(weights)
     return model.to(device).requires_grad_(False).eval()
-
-
-def _to_json(value: Nested, tensors: dict[str, Tensor]) -> Any:  # noqa: ANN401 - a JSON value
-    """Add the tensors of a training state to `tensors`; return all else as a JSON value."""
-    match value:
-        case torch.Tensor():
-            name = str(len(tensors))
-            tensors[name] = value
-            return {"tensor": name}
-        case None | bool() | int() | float():
-            return value
-        case list():
-            return [_to_json(item, tensors) for item in value]
-        case tuple():
-            return {"tuple": [_to_json(item, tensors) for item in value]}
-        case Mapping() if all(isinstance(key, str | int) for key in value):
-            return {"items": [[key, _to_json(item, tensors)] for key, item in value.items()]}
-    raise BadInputError(f"expected tensors, numbers, and containers of them by str or int, got {type(value).__name__}")
-
-
-def _from_json(state: Any, tensors: Mapping[str, Tensor]) -> Any:  # noqa: ANN401 - a training state
-    match state:
-        case {"tensor": name}:
-            return tensors[name]
-        case {"tuple": items}:
-            return tuple(_from_json(item, tensors) for item in items)
-        case {"items": items}:
-            return {key: _from_json(item, tensors) for key, item in items}
-        case list():
-            return [_from_json(item, tensors) for item in state]
-    return state
 
 
 class Logbook:

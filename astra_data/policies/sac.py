@@ -201,8 +201,8 @@ class Replay:
         return drawn, ~drawn["expired"][:, :-1] & (filled | has_begun)
 
     def state_dict(self) -> dict[str, Tensor | int]:
-        """Return the kept steps."""
-        return {"added": self._added} | {name: column[: len(self)] for name, column in self._columns.items()}
+        """Return the kept steps, apart from the room for others."""
+        return {"added": self._added} | {name: column[: len(self)].clone() for name, column in self._columns.items()}
 
     def load_state_dict(self, state: Mapping[str, Tensor | int]) -> None:
         """Continue with the steps in `state`."""

@@ -137,7 +137,7 @@ def test_a_disk_that_fails_at_any_operation_leaves_a_folder_to_go_on_with(
 
 def test_what_a_kill_left_in_the_working_folder_is_not_published(tmp_path: Path) -> None:
     partial = tmp_path / ".out.partial"
-    (partial / ".checkpoint.safetensors.tmp-7").mkdir(parents=True)
+    (partial / ".checkpoint.pt.tmp-7").mkdir(parents=True)
     (partial / ".model.safetensors.tmp-8").touch()
     with finished_folder(tmp_path / "out", config="1") as folder:
         (folder / "model").touch()

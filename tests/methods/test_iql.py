@@ -96,9 +96,9 @@ def test_fine_tuning_takes_fewer_and_smaller_updates_of_the_given_policy(
     before = {name: value.clone() for name, value in given.policy.state_dict().items()}
     rested, _ = learn(given, fine_tuning_updates=0)
     assert all(torch.equal(rested.policy.state_dict()[name], value) for name, value in before.items())
-    (tmp_path / "checkpoint.safetensors").unlink()
+    (tmp_path / "checkpoint.pt").unlink()
     tuned, curve = learn(given)
-    (tmp_path / "checkpoint.safetensors").unlink()
+    (tmp_path / "checkpoint.pt").unlink()
     learn()
     tuning, anew = configs[1:]
     assert (tuning.policy_updates, tuning.learning_rate) == (5, anew.learning_rate / 10)
@@ -128,14 +128,14 @@ def test_cloning_does_what_was_recorded_whatever_it_paid(
             seen.observation[..., :8], seen.previous_action, policy.initial_hidden(6), start
         )
         mean[how] = float(policy.act(features)[episodes.windows.mask.bool()].mean().detach())
-        (tmp_path / "checkpoint.safetensors").unlink()
+        (tmp_path / "checkpoint.pt").unlink()
     recorded = float(episodes.windows.action[episodes.windows.mask.bool()].mean())
     assert mean[clone_behavior] == pytest.approx(recorded, abs=0.15) and mean[learn_from_episodes] > recorded + 0.3
 
 
 def test_cloning_is_iql_at_temperature_zero(learn: Learn, tmp_path: Path) -> None:
     cloned = learn(how=clone_behavior)[0].policy
-    (tmp_path / "checkpoint.safetensors").unlink()
+    (tmp_path / "checkpoint.pt").unlink()
     plain = learn(temperature=0.0, critic_updates=1)[0].policy
     assert all(map(torch.equal, cloned.parameters(), plain.parameters()))
 
@@ -144,7 +144,7 @@ def test_after_an_interruption_it_goes_on(
     learn: Learn, given: PolicyFile, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(iql, "_CHECKPOINT_EVERY", 15)
-    checkpoint = tmp_path / "checkpoint.safetensors"
+    checkpoint = tmp_path / "checkpoint.pt"
     whole, curve = learn(given)
     checkpoint.unlink()
     seen: list[float] = []

@@ -243,7 +243,7 @@ def _trained(
         observation = world.load_state_dict(state["world"])
         learner.load_state_dict(state["learner"], observation, goes_on=bool(state["world"]))
 
-    logbook = Logbook(folder / "training.safetensors", go_on)
+    logbook = Logbook(folder / "training.pt", go_on)
     share = logbook.points[-1]["share"] if logbook.points else 0.0
     while share < 1.0:
         share, note = judge(learner.iterate())
