@@ -196,7 +196,7 @@ class GroundedSimulator(EpisodeSimulator):
             state = self._settle(before, corrected)
             self._touches = None if self._touches is None else self.simulator.blocked
         if self.scatter_model is not None:
-            state = self._settle(before, state + self.scatter_model.draw(inputs))
+            state = self._settle(before, state + self.model.changed(inputs, self.scatter_model.draw(inputs)))
         self.hidden = self._encoded(state, self.goal, action, self.hidden)
         return state
 

@@ -5,12 +5,14 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 from astra_data.core.arrays import normalized
 from astra_data.core.errors import BadInputError
 from astra_data.grounding.encoder import ENCODERS, HistoryEncoder, PositionFeatures, mlp
 from astra_data.grounding.paired_episodes import PairedEpisodes, PairedWindows
 
+_TOUCHED = 0.1  # of the deviation of corrections: a ball that needs more of one is touched
 _BALL_M = 0.1  # unit of the ball's position relative to the robot: less than this decides whether they touch
 _EMA_RATE = 0.01  # by how much the target encoder follows the encoder in each update
 
@@ -44,6 +46,12 @@ class GroundingShape:
         """Whether states end with a ball's position and velocity."""
         return self.ball_index is not None and self.ball_index + 4 == self.state_size
 
+    @property
+    def lying_ball(self) -> slice | None:
+        """Where states hold a ball's position without its velocity: it lies there until it is touched."""
+        index = self.ball_index
+        return None if index is None or self.ball_rolls else slice(index, index + 2)
+
 
 class GroundingModel(nn.Module):
     """ψ^s, P_lat, R_pred and f_abs on one history encoder; scales are buffers, so that files hold them."""
@@ -64,6 +72,7 @@ class GroundingModel(nn.Module):
         # Hits are too few to be learned beside the rest: see `fit_hits`.
         self.corrected_size = states - 2 if shape.ball_rolls else states
         self.hits = mlp((latent + actions + features, *heads, 1)) if shape.ball_rolls else None
+        self.touched = mlp((latent + actions + features, *heads, 1)) if shape.lying_ball else None
         # An untrained correction is the identity: the raw simulator.
         for network in (self.correction, *([self.hits] if self.hits else [])):
             for parameter in list(network.parameters())[-2:]:
@@ -141,10 +150,18 @@ class GroundingModel(nn.Module):
 
     def corrected(self, inputs: Tensor, simulated_next: Tensor) -> Tensor:
         """Return what `correct` does, given its `correction_inputs` (..., I)."""
-        corrected: Tensor = simulated_next + self.correction(inputs) * self.correction_std
+        corrected: Tensor = simulated_next + self.changed(inputs, self.correction(inputs) * self.correction_std)
         if self.hits is None:
             return corrected
         return torch.cat([corrected[..., :-2], self.rolling(inputs, simulated_next)], dim=-1)
+
+    def changed(self, inputs: Tensor, change: Tensor) -> Tensor:
+        """Return the changes (..., X) of a step, those of a lying ball times the probability that it is touched."""
+        if self.touched is None:
+            return change
+        share = torch.ones_like(change)
+        share[..., self.shape.lying_ball] = self.touched(inputs).sigmoid()
+        return change * share
 
     def rolling(self, inputs: Tensor, simulated_next: Tensor) -> Tensor:
         """Return the velocity (..., 2) of the ball: the share of the simulator's that comes true."""
@@ -182,10 +199,22 @@ class GroundingModel(nn.Module):
             normal = self.reward_head(torch.cat([latent, action], dim=-1))
             parts["reward"] = 0.5 * _masked_mean((normal - true).square().sum(-1), windows.goes_on * mask)
             total = total + weights.reward * parts["reward"]
-        corrected = self.correct(latent, action, windows.simulated_next)
+        seen = self.correction_inputs(latent, action, windows.simulated_next)
+        corrected = self.corrected(seen, windows.simulated_next)
+        if self.touched is not None:
+            parts["touched"] = _masked_mean(self._touched_bce(seen, windows), mask)
+            total = total + parts["touched"]
         error = ((corrected - windows.next_state) / self.correction_std)[..., : self.corrected_size].square().mean(-1)
         parts["state"] = _masked_mean(error, mask)
         return total + parts["state"], parts
+
+    def _touched_bce(self, inputs: Tensor, windows: PairedWindows) -> Tensor:
+        """Return the binary cross-entropy (B, T) of whether a lying ball moved other than in the simulator."""
+        assert self.touched is not None
+        correction = (windows.next_state - windows.simulated_next) / self.correction_std
+        moved = (correction[..., self.shape.lying_ball].norm(dim=-1) > _TOUCHED).float()
+        logits = self.touched(inputs).squeeze(-1)
+        return functional.binary_cross_entropy_with_logits(logits, moved, reduction="none")
 
     @torch.no_grad()
     def _following_latent(self, inputs: Tensor) -> Tensor:

@@ -256,6 +256,7 @@ class Task:
         abstract_state: the column of abstract states, by default the simulator's.
         beyond: what φ drops, scaled to about 1, (..., S) to (..., R); by default the whole state.
         quantities: indices in abstract states of what the gap report lists, by name with unit; by default each.
+            `ball_position_m`, x and y, is of what the robot kicks or pushes: corrections see how far it is.
         facts: what datasets record about the target environment.
         simulator_id: names the abstract simulator in datasets, by default after its class.
         varied: the same simulator with parameters that vary, by default what reaches it of the commands.

@@ -1,4 +1,4 @@
-"""Whether a ball is hit: the share of the simulator's velocity of it that comes true."""
+"""Whether a ball is hit: the share of the simulator's velocity that comes true, or of one that lies, any move."""
 
 import pytest
 import torch
@@ -92,3 +92,62 @@ def test_scatter_sets_no_ball_rolling() -> None:
     simulator.start(state, torch.arange(500), torch.zeros(500, 2))
     after = simulator.step(torch.tensor([0.0, 0.0, 1.0]).expand(500, 3))
     assert torch.equal(after[:, 4:], state[:, 4:])
+
+
+CONTACT_M, PUSHED_M = 0.06, 0.02
+
+
+def pushes(seed: int = 0) -> PairedEpisodes:
+    """Steps in which a gripper pushes a puck within 0.06 m ahead, while the simulator leaves all where it is."""
+    torch.manual_seed(seed)
+    distance, angle = 0.3 * torch.rand(EPISODES, STEPS, 1), 7 * torch.rand(EPISODES, STEPS, 1)
+    way = torch.cat([angle.cos(), angle.sin()], dim=-1)
+    gripper = torch.randn(EPISODES, STEPS, 2)
+    state = torch.cat([gripper, gripper + distance * way], dim=-1)
+    after = state + torch.cat([0.02 * torch.randn_like(way), PUSHED_M * way * (distance < CONTACT_M)], dim=-1)
+    return toy_episodes(state, torch.ones(EPISODES, STEPS, 2), simulated_next=state, next_state=after)
+
+
+def puck_model() -> GroundingModel:
+    torch.manual_seed(0)
+    return GroundingModel(GroundingShape(4, 2, 2, latent_size=8, position_octaves=0, ball_index=2))
+
+
+def test_a_ball_that_lies_moves_where_it_is_touched_alone() -> None:
+    model, training = puck_model(), pushes()
+    model.correction_std.fill_(PUSHED_M / 2)
+    optimizer = torch.optim.Adam(model.parameters(), lr=3e-3)
+    for _ in range(300):
+        loss, parts = model.losses(training.windows, LATENT_ALONE)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    torch.testing.assert_close(loss, parts["state"] + parts["touched"])
+    model.requires_grad_(False)
+    windows = pushes(1).windows
+    latent, _ = model.encode(windows)
+    inputs = model.correction_inputs(latent, windows.action, windows.simulated_next)
+    distance = (windows.state[..., 2:] - windows.state[..., :2]).norm(dim=-1)
+    near, far = distance < 0.8 * CONTACT_M, distance > 1.5 * CONTACT_M
+    moved = (model.corrected(inputs, windows.simulated_next) - windows.state)[..., 2:].norm(dim=-1)
+    assert 0.6 * PUSHED_M < float(moved[near].mean()) < 1.1 * PUSHED_M and float(moved[far].max()) < PUSHED_M / 20
+    changed = model.changed(inputs, torch.ones_like(windows.state))
+    assert float(changed[near][..., 2:].mean()) > 0.9 and float(changed[far][..., 2:].max()) < 0.02
+    assert torch.equal(changed[..., :2], torch.ones_like(changed[..., :2]))
+    scatter, _ = fit_scatter(model, training, pushes(1), seed=0)
+    assert model.touched is not None
+    list(model.touched.parameters())[-1].fill_(-200.0)  # none is touched
+    simulator = HistoryGrounding(model, scatter_model=scatter).simulator(TASKS["antmaze-umaze"], 100)
+    state = torch.tensor([0.0, 0.0, 0.3, 0.0]).expand(100, 4)
+    simulator.start(state, torch.arange(100), torch.zeros(100, 2))
+    after = simulator.step(torch.zeros(100, 2))
+    landed = TASKS["antmaze-umaze"].simulator(100)
+    landed.reset_to(state)
+    assert torch.equal(after[:, 2:], landed.step(torch.zeros(100, 2))[:, 2:]) and after[:, 0].unique().numel() > 50
+
+
+def test_which_shapes_have_a_ball_that_lies() -> None:
+    assert puck_model().touched is not None and puck_model().hits is None
+    assert ball_model().touched is None and ball_model().shape.lying_ball is None
+    plain = GroundingModel(GroundingShape(4, 2, 2))
+    assert plain.touched is None and plain.changed(torch.zeros(1, 1), torch.ones(1, 4)).equal(torch.ones(1, 4))

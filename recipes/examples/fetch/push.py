@@ -84,6 +84,7 @@ TASK = Task(
     state=Column("observation.state", size=25),
     commands={"x": (-1.0, 1.0), "y": (-1.0, 1.0)},
     make_simulator=GripperAndPuck,
+    quantities={"gripper_m": (0, 1), "ball_position_m": (2, 3)},
     objective=Push(horizon=100, success_reward=5.0, failure_reward=-5.0),
     robot=partial(GymnasiumRobot, "gymnasium_robotics:FetchPush-v4", command=in_the_plane, failed=fell),
 )
