@@ -93,15 +93,14 @@ def unit_vectors(abstract: Tensor) -> list[tuple[int, int]]:
 
 def gaussian_mmd(mean_1: Tensor, variance_1: Tensor, mean_2: Tensor, variance_2: Tensor, bandwidths: Tensor) -> Tensor:
     """Return the squared MMD (...) of diagonal Gaussians (..., Z) with Gaussian kernels of `bandwidths` (K,)."""
-    squared = bandwidths.square().unsqueeze(-1)
-    apart = (mean_1 - mean_2).square().unsqueeze(-2)
+    # Relative to the bandwidths, which takes fewer operations on (..., K, Z), where the time goes.
+    inverse = bandwidths.square().reciprocal().unsqueeze(-1)
+    apart = (mean_1 - mean_2).square().unsqueeze(-2) * inverse
 
     def mean_kernel(variance: Tensor, *, is_own: bool) -> Tensor:
-        spread = squared + variance.unsqueeze(-2)
-        exponent = (squared / spread).log()
-        if not is_own:
-            exponent = exponent - apart / spread
-        return (0.5 * exponent.sum(-1)).exp().mean(-1)
+        spread = 1.0 + variance.unsqueeze(-2) * inverse
+        exponent = spread.log() if is_own else spread.log() + apart / spread
+        return (-0.5 * exponent.sum(-1)).exp().mean(-1)
 
     return (
         mean_kernel(2.0 * variance_1, is_own=True)
