@@ -6,10 +6,12 @@ import numpy as np
 from astra_data.core.arrays import Floats
 from astra_data.robots.nao.robot import nao_model
 from astra_data.robots.nao.tasks import PerceptionErrors
-from astra_data.robots.nao.walk import FOOT_HEIGHT_M, TO_MOTORS
+from astra_data.robots.nao.walk import FOOT_HEIGHT_M, TO_MOTORS, TraitSpread
 
 NO_ERRORS = PerceptionErrors(*(0.0,) * 3, 2.0, 0.0, (0.0, 0.0), *(0.0,) * 4, 0.5, 0.0, np.pi, 0.0)
 """Exact estimates."""
+IDENTICAL = TraitSpread(0.0, 0.0, (2, 2), (0.6, 0.6), 0.0, (1.0, 1.0))
+"""All robots alike, without noise."""
 
 
 def foot_poses(angles: Floats) -> Floats:

@@ -50,6 +50,13 @@ class Reach(Objective):
         return after[:, 0] - before[:, 0] + ends
 
 
+class Near(Reach):
+    """Get 0.3 m ahead."""
+
+    def draw_goals(self, rng: np.random.Generator, count: int) -> Any:
+        return np.full((count, 1), 0.3)
+
+
 class Last(Reach):
     """To be on the rail until the end is all that is asked."""
 

@@ -21,19 +21,13 @@ def test_worlds_and_columns_fit_together(task: Task) -> None:
     assert registry.TASKS[task.name] is task and task.fps * task.timestep_s == pytest.approx(1.0, abs=0.05)
     sizes = {column.name: column.size for column in task.state_columns}
     env = task.target(2, seed=0, num_threads=1)
-    observation = env.reset()
+    env.reset()
     assert env.state.shape == (2, sizes[STATE])
-    assert env.step(torch.zeros(2, sizes[ACTION])).observation.shape == observation.shape
     assert sizes[ACTION] == env.action_size == task.objective.action_size
     assert sizes.get(GOAL, 0) == env.goal.shape[1] == task.objective.goal_size
-    abstract = task.abstraction(env.state)
     entries = [entry for group in task.quantities.values() for entry in group]
     assert set(entries) <= set(range(task.abstract_state.size)) and len(entries) == len(set(entries))
-    simulator = task.simulator(2)
-    assert abstract.shape == simulator.state.shape == (2, task.abstract_state.size)
-    assert simulator.parameters["timestep_s"] == task.timestep_s
-    started = torch.from_numpy(task.objective.draw_starts(np.random.default_rng(0), 2))
-    assert started.shape == abstract.shape
+    assert task.simulator(1).parameters["timestep_s"] == task.timestep_s
 
 
 @pytest.mark.parametrize("task", registry.TASKS.values(), ids=registry.TASKS)

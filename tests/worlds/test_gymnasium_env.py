@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
-from small_cart import TASK, Reach
+from small_cart import TASK, Near
 
 from astra_data.core.errors import BadInputError
 from astra_data.worlds.commands import Commands
@@ -99,13 +99,6 @@ class Corridor(gymnasium.Env[Any, Any]):
     def step(self, action: NDArray[np.float64]) -> Any:
         self.x += 0.1 * float(action[0])
         return [self.x, float(action[0])], 0.0, abs(self.x) >= 0.4, False, {}
-
-
-class Near(Reach):
-    """Get 0.3 m ahead."""
-
-    def draw_goals(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
-        return np.full((count, 1), 0.3)
 
 
 def corridor(**functions: Any) -> RobotEnv:

@@ -4,8 +4,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
-from small_cart import TASK, Cart, Reach
+from small_cart import TASK, Cart, Near, Reach
 
 from astra_data.core.errors import BadInputError
 from astra_data.policies.episodes import in_target
@@ -23,10 +22,6 @@ def test_robots_are_stepped_by_commands_in_their_units() -> None:
 
 
 def test_a_robot_that_fails_at_its_goal_does_not_succeed() -> None:
-    class Near(Reach):
-        def draw_goals(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
-            return np.full((count, 1), 0.3)
-
     env = replace(TASK, objective=Near(horizon=40)).target(1, seed=0)
     env.reset()
     step = env.step(torch.tensor([[1.0]]))  # to 0.36 m, pushed too hard

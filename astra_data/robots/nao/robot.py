@@ -271,7 +271,7 @@ class BatchedNao:
         """Continue from `state` of robots that were built with the same arguments."""
         for name, value in self._arrays().items():
             value[:] = state[name]
-        self._seed, self._steps = int(state.get("seed", self._seed)), int(state["steps"])
+        self._seed, self._steps = int(state["seed"]), int(state["steps"])
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
         bodies = self.bodies

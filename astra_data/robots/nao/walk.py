@@ -104,9 +104,6 @@ class TraitSpread:
     """Range of the factor on the top speeds: B-Human's limits of a worn and of a new robot."""
 
 
-IDENTICAL = TraitSpread(0.0, 0.0, (2, 2), (0.6, 0.6), 0.0, (1.0, 1.0))  # all robots alike, without noise
-
-
 @dataclass(frozen=True)
 class Traits:
     """The traits of B robots."""

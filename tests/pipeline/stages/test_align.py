@@ -10,6 +10,7 @@ from small_run import ALIGN
 from stopping import Stopped
 from toy_episodes import no_episodes
 
+from astra_data.core.durable import file_digest
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, silent
 from astra_data.dataset.columns import ABSTRACT_STATE, STATE, Column
@@ -23,13 +24,15 @@ from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.pipeline.stages.align import AlignConfig, align
 
 
-def test_the_target_encoder_comes_closer_to_the_source(aligned: Path) -> None:
+def test_the_target_encoder_comes_closer_to_the_source(aligned: Path, grounded: Path) -> None:
     assert {file.name for file in aligned.iterdir()} == {
         "config.json",
         "manifest.json",
         "metrics.json",
         "target_encoder.safetensors",
     }
+    told = json.loads((aligned / "config.json").read_text())
+    assert told["grounding_sha256"] == file_digest(grounded / "grounding.safetensors")
     metrics = json.loads((aligned / "metrics.json").read_text())
     assert {"git_commit", "packages", "machine"} <= metrics.keys()
     first, last = metrics["points"]
@@ -131,19 +134,6 @@ def test_after_an_interruption_it_goes_on(paired: Path, grounded: Path, aligned:
     assert (out / name).read_bytes() == (aligned / name).read_bytes()
     told, expected = (json.loads((folder / "metrics.json").read_text()) for folder in (out, aligned))
     assert told["points"] == expected["points"]
-
-
-def test_what_was_begun_with_another_grounding_is_refused(
-    paired: Path, grounded: Path, grounded_anew: Path, tmp_path: Path
-) -> None:
-    def begin(grounding: Path, progress: Progress) -> None:
-        out = tmp_path / "out"
-        align(ALIGN, dataset=paired, grounding=grounding, seed=0, out=out, device="cpu", progress=progress)
-
-    with pytest.raises(Stopped):
-        begin(grounded, stop)
-    with pytest.raises(BadInputError, match=r"partial was started with other settings .*: remove it"):
-        begin(grounded_anew, silent)
 
 
 def test_the_encoder_is_as_large_as_the_source_and_sees_as_many_waves(paired: Path, tmp_path: Path) -> None:

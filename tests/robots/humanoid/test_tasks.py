@@ -1,7 +1,5 @@
 import json
 import math
-from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,15 +13,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from astra_data.core.errors import BadInputError
-from astra_data.core.progress import silent
-from astra_data.dataset.columns import GOAL, SUCCESS
+from astra_data.dataset.columns import GOAL
 from astra_data.dataset.reader import Dataset
 from astra_data.grounding.files import load_history_model
-from astra_data.pipeline.stages.collect import CollectConfig, collect
-from astra_data.pipeline.stages.evaluate import EvaluateConfig, evaluate
-from astra_data.pipeline.stages.pair import PairConfig, pair
-from astra_data.pipeline.stages.train import train
-from astra_data.policies.train import PpoTrainConfig
 from astra_data.robots.humanoid import target as humanoid
 from astra_data.robots.humanoid import tasks
 from astra_data.robots.humanoid.tasks import (
@@ -247,11 +239,6 @@ def test_without_opengl_there_is_one_clear_error(monkeypatch: pytest.MonkeyPatch
 HUMANOID_TASKS = (tasks.WALKER2D, tasks.KINEMATICS, tasks.EXTENDED)
 
 
-LASTING = "humanoid-short"
-HORIZON = 12
-"""Steps after which none has fallen yet."""
-
-
 @pytest.mark.parametrize("task", HUMANOID_TASKS, ids=lambda task: task.name)
 def test_phi_and_what_is_beyond_it_lose_only_the_place(task: Task) -> None:
     generator = torch.Generator().manual_seed(0)
@@ -297,39 +284,3 @@ def test_a_simulator_without_goals_is_grounded(tmp_path: Path) -> None:
     assert (model.shape.goal_size, model.shape.position_octaves) == (0, 0)
     gap = json.loads((ground / "gap.json").read_text())
     assert gap["raw"].keys() == TASKS["humanoid-walker2d"].quantities.keys()
-
-
-@pytest.fixture
-def lasting() -> Iterator[None]:
-    usual = TASKS["humanoid-kinematics"]
-    TASKS[LASTING] = replace(usual, name=LASTING, objective=replace(usual.objective, horizon=HORIZON))
-    yield
-    del TASKS[LASTING]
-
-
-def recorded(out: Path, max_steps: int) -> Path:
-    config = CollectConfig(episodes=3, max_steps=max_steps, start="task", hold_s=(0.03, 0.2))
-    return collect(LASTING, config, seed=0, out=out, progress=silent, num_threads=1)
-
-
-@pytest.mark.usefixtures("lasting")
-def test_who_lasts_to_the_horizon_succeeds_everywhere(tmp_path: Path) -> None:
-    early = Dataset.open(recorded(tmp_path / "early", HORIZON - 1))
-    late = Dataset.open(recorded(tmp_path / "late", HORIZON))
-    assert early.metadata["success"] == [False] * 3
-    for episode in late.episodes():
-        np.testing.assert_array_equal(episode.columns[SUCCESS], np.arange(HORIZON) == HORIZON - 1)
-    paired = pair(LASTING, PairConfig(), dataset=tmp_path / "late", out=tmp_path / "paired", progress=silent)
-    config = PpoTrainConfig(num_envs=4, rollout_steps=8, total_steps=64, hidden_sizes=(8,), memory_size=8)
-    usual: dict[str, Any] = {"grounding": None, "seed": 0, "progress": silent}
-    policy, evaluated = tmp_path / "policy", tmp_path / "evaluated"
-    train(LASTING, "direct_transfer", config, dataset=paired, out=policy, device="cpu", **usual)
-    curve = json.loads((policy / "curve.json").read_text())
-    assert {point["success"] for point in curve["points"]} == {None}
-    assert 0 < curve["points"][0]["episode_steps"] <= HORIZON
-    setting = EvaluateConfig(episodes=2)
-    usual |= {"target_encoder": None, "num_threads": 1}
-    evaluate(LASTING, "direct_transfer", setting, policy=policy, out=evaluated, **usual)
-    evaluation = json.loads((evaluated / "evaluation.json").read_text())
-    for world in ("target", "simulated", "raw"):
-        assert evaluation[world]["success"] == [1.0, 1.0] and evaluation[world]["steps"] == [HORIZON, HORIZON]

@@ -4,6 +4,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from nao_values import IDENTICAL
 from numpy.typing import NDArray
 
 from astra_data.core.arrays import Floats
@@ -72,7 +73,7 @@ FIRST = 3  # the longest delay: so many angles are under way when a control step
 def bodies(
     count: int = 1, *, height_m: float = 0.0, style: legs.WalkStyle = STYLE, **traits: NDArray[Any]
 ) -> BatchedBodies:
-    drawn = replace(legs.Traits.draw(legs.IDENTICAL, count, np.random.default_rng(0)), **traits)
+    drawn = replace(legs.Traits.draw(IDENTICAL, count, np.random.default_rng(0)), **traits)
     made = BatchedBodies(nao_model(), drawn, longest_delay_ticks=FIRST, style=style, num_threads=1)
     qpos = np.tile(made.model.qpos0, (count, 1))
     qpos[:, 2] = STYLE.hip_height_m + legs.HIP_OFFSET_Z_M + height_m
@@ -176,7 +177,7 @@ def test_a_robot_that_leans_by_over_45_degrees_any_way_has_fallen(axis: int, deg
     "command", [(0.2, 0.0, 0.0), (-0.12, 0.0, 0.0), (0.0, 0.15, 0.0), (0.0, -0.15, 0.0), (0.0, 0.0, 0.8)]
 )
 def test_it_walks_as_told(command: tuple[float, float, float]) -> None:
-    nao = BatchedNao(1, seed=0, spread=legs.IDENTICAL, num_threads=1)
+    nao = BatchedNao(1, seed=0, spread=IDENTICAL, num_threads=1)
     poses = []
     for _ in range(25):
         nao.step(np.array([command]))
@@ -205,7 +206,7 @@ def test_a_lean_to_the_right_and_one_ahead_are_positive_and_tilts_see_no_heading
 
 def test_walls_are_felt_and_stop_it() -> None:
     # The wall's face is at x = -6; the robot's toes are 0.1 m ahead of it.
-    nao = BatchedNao(2, seed=0, maze=U_MAZE, spread=legs.IDENTICAL, num_threads=1)
+    nao = BatchedNao(2, seed=0, maze=U_MAZE, spread=IDENTICAL, num_threads=1)
     nao.reset(np.arange(2), np.array([[-5.7, 4.0, np.pi], [-4.0, 4.0, np.pi]]), np.random.default_rng(0))
     felt = np.zeros(2, dtype=bool)
     for _ in range(15):
@@ -230,7 +231,7 @@ def test_a_fallen_robot_is_told_and_stays_until_its_reset() -> None:
 @pytest.mark.parametrize("side", [1, -1])
 def test_balls_are_kicked_by_the_foot_on_their_side_wherever_the_robot_looks(side: int) -> None:
     yaw = np.array([0.0, 1.5, 3.0, -1.5])
-    nao = BatchedNao(4, seed=0, ball=True, spread=legs.IDENTICAL, num_threads=1)
+    nao = BatchedNao(4, seed=0, ball=True, spread=IDENTICAL, num_threads=1)
     ball = np.exp(1j * yaw) * (0.3 + 0.06j * side)
     nao.reset(
         np.arange(4),
