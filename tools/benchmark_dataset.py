@@ -87,8 +87,7 @@ def measurements(root: Path, data: list[Episode], lerobot: Any) -> Iterator[tupl
         },
     )
     windows, padded = frames.windows(LENGTH), frames.windows(LENGTH, padding="edge")
-    order: Any = windows.batches(BATCH).order
-    loader = torch.utils.data.DataLoader(windows, batch_sampler=order, collate_fn=lambda batch: batch)
+    loader = torch.utils.data.DataLoader(windows, BATCH, shuffle=True, collate_fn=lambda batch: batch)
     yield (
         f"windows of {LENGTH} steps drawn",
         {

@@ -25,52 +25,6 @@ IS_PAD = "is_pad"
 Batch = dict[str, Tensor]  # column name to (B, ...)
 
 
-class Order:
-    """Indices (B,) of `count` samples, batch by batch, reshuffled by (seed, epoch); goes on from `batch` of `epoch`."""
-
-    def __init__(
-        self, count: int, batch_size: int, *, seed: int = 0, shuffle: bool = True, drop_last: bool = False
-    ) -> None:
-        whole, rest = divmod(count, max(batch_size, 1))
-        self._batches = whole + (rest > 0 and not drop_last)
-        if batch_size < 1 or self._batches < 1:
-            raise BadInputError(f"batches of {batch_size} out of {count} samples: expected 1 to {count}")
-        self._settings = {"count": count, "batch_size": batch_size, "seed": seed}
-        self._settings |= {"shuffle": shuffle, "drop_last": drop_last}
-        self.epoch = self.batch = 0
-
-    def __len__(self) -> int:
-        return self._batches
-
-    def __iter__(self) -> Iterator[Tensor]:
-        """Yield the batches (B,) that are left of this epoch."""
-        epoch, count, size = self.epoch, self._settings["count"], self._settings["batch_size"]
-        order = torch.arange(count)
-        if self._settings["shuffle"]:
-            numbers = generator(self._settings["seed"], f"order of epoch {epoch}")
-            order = torch.from_numpy(numbers.permutation(count))
-        for batch in range(self.batch, len(self)):
-            # Set before yielding, so that a state saved inside the loop names the next batch.
-            self.epoch, self.batch = (epoch, batch + 1) if batch + 1 < len(self) else (epoch + 1, 0)
-            yield order[batch * size : (batch + 1) * size]
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the settings and the next batch: plain numbers, for `load_state_dict`."""
-        return {**self._settings, "epoch": self.epoch, "batch": self.batch}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from `state`, unless it belongs to another order or names a batch that does not exist."""
-        epoch, batch = state.get("epoch"), state.get("batch")
-        settings = {key: state.get(key) for key in self._settings}
-        is_batch = type(epoch) is int and epoch >= 0 and type(batch) is int and 0 <= batch < len(self)
-        if settings != self._settings or not is_batch:
-            raise BadInputError(
-                f"the state is of another order of samples: expected {self._settings} and a batch of 0 to "
-                f"{len(self) - 1}, got {state}"
-            )
-        self.epoch, self.batch = state["epoch"], state["batch"]
-
-
 class Samples(data.Dataset[Batch]):
     """Samples of one shape, drawn one by one or in batches; a `DataLoader` needs a `collate_fn` of no effect."""
 
@@ -92,23 +46,50 @@ class Samples(data.Dataset[Batch]):
         first = take(self._first, torch.as_tensor(index, device=self._first.device))
         return {name: values.to(self._device) for name, values in self._gather(first).items()}
 
-    def batches(self, batch_size: int, *, seed: int = 0, shuffle: bool = True, drop_last: bool = False) -> "Batches":
-        """Draw batches; the arguments are those of `Order`."""
-        return Batches(self, Order(len(self), batch_size, seed=seed, shuffle=shuffle, drop_last=drop_last))
+    def batches(self, batch_size: int, *, seed: int = 0, shuffle: bool = True) -> "Batches":
+        """Draw batches, reshuffled each epoch by `seed` and its number; the last of an epoch may be smaller."""
+        return Batches(self, batch_size, seed=seed, shuffle=shuffle)
 
 
 class Batches:
-    """Batches of `samples` in `order`, one epoch per iteration."""
+    """Batches of `samples`, the rest of an epoch per iteration; goes on from `batch` of `epoch`."""
 
-    def __init__(self, samples: Samples, order: Order) -> None:
-        self.samples, self.order = samples, order
-        self.state_dict, self.load_state_dict = order.state_dict, order.load_state_dict
+    def __init__(self, samples: Samples, batch_size: int, *, seed: int, shuffle: bool) -> None:
+        if batch_size < 1:
+            raise BadInputError(f"batches of {batch_size} samples: expected at least 1")
+        self._samples = samples
+        self._settings = {"count": len(samples), "batch_size": batch_size, "seed": seed, "shuffle": shuffle}
+        self.epoch = self.batch = 0
 
     def __len__(self) -> int:
-        return len(self.order)
+        return -(-len(self._samples) // self._settings["batch_size"])
 
     def __iter__(self) -> Iterator[Batch]:
-        return map(self.samples.__getitems__, self.order)
+        epoch, count, size = self.epoch, self._settings["count"], self._settings["batch_size"]
+        order = torch.arange(count)
+        if self._settings["shuffle"]:
+            numbers = generator(self._settings["seed"], f"order of epoch {epoch}")
+            order = torch.from_numpy(numbers.permutation(count))
+        for batch in range(self.batch, len(self)):
+            # Set before yielding, so that a state saved inside the loop names the next batch.
+            self.epoch, self.batch = (epoch, batch + 1) if batch + 1 < len(self) else (epoch + 1, 0)
+            yield self._samples.__getitems__(order[batch * size : (batch + 1) * size])
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the settings and the next batch: plain numbers, for `load_state_dict`."""
+        return {**self._settings, "epoch": self.epoch, "batch": self.batch}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from `state`, unless it belongs to another order or names a batch that does not exist."""
+        epoch, batch = state.get("epoch"), state.get("batch")
+        settings = {key: state.get(key) for key in self._settings}
+        is_batch = type(epoch) is int and epoch >= 0 and type(batch) is int and 0 <= batch < len(self)
+        if settings != self._settings or not is_batch:
+            raise BadInputError(
+                f"the state is of another order of samples: expected {self._settings} and a batch of 0 to "
+                f"{len(self) - 1}, got {state}"
+            )
+        self.epoch, self.batch = state["epoch"], state["batch"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -188,18 +169,17 @@ class Frames:
         columns = ", ".join(f"{name} {tuple(values.shape[1:])}" for name, values in self.columns.items())
         return f"Frames({len(self.lengths)} episodes, {len(self)} steps, {columns}, to {self.device})"
 
-    def windows(self, length: int, *, stride: int = 1, padding: Padding = "valid", past: int = 0) -> Samples:
+    def windows(self, length: int, *, padding: Padding = "valid", past: int = 0) -> Samples:
         """Return windows of L consecutive steps of one episode, with "is_pad" (L,), true outside of it.
 
-        Padding "valid" gives windows inside their episode; "edge" one at every step t (of a `stride`), which
-        begins `past` steps before t and is padded with the first or the last step, as in lerobot's
-        `delta_timestamps`. A BadInputError lists every argument that is out of range.
+        Padding "valid" gives windows inside their episode; "edge" one at every step t, which begins `past` steps
+        before t and is padded with the first or the last step, as in lerobot's `delta_timestamps`.
+        A BadInputError lists every argument that is out of range.
         """
         longest = int(self.lengths.max())
         is_valid, is_edge = padding == "valid", padding == "edge"
         checks = {
             f"length {length}, expected at least 1": length < 1,
-            f"stride {stride}, expected at least 1": stride < 1,
             f"length {length}, expected at most {longest}, the longest episode's, or padding 'edge'": (
                 is_valid and length > longest
             ),
@@ -210,12 +190,12 @@ class Frames:
         if faults := [fault for fault, is_one in checks.items() if is_one]:
             raise BadInputError(f"Windows: {'; '.join(faults)}.")
         counts = self.lengths if is_edge else (self.lengths - length + 1).clamp_min(0)
-        first = _every(stride, self.starts - past, counts)
+        first = _every(self.starts - past, counts)
         return Samples(first, partial(self._windows, past, length), self.device)
 
     def transitions(self) -> Samples:
         """Return single steps; the step's outcome is in its columns `next.*`."""
-        return Samples(_every(1, self.starts, self.lengths), self._rows, self.device)
+        return Samples(_every(self.starts, self.lengths), self._rows, self.device)
 
     def _rows(self, rows: Tensor) -> Batch:
         return {name: take(values, rows) for name, values in self.columns.items()}
@@ -231,12 +211,10 @@ class Frames:
         return shaped | {IS_PAD: rows != wanted}
 
 
-def _every(stride: int, begins: Tensor, counts: Tensor) -> Tensor:
-    """Return every `stride`-th of the `counts` (E,) rows from each of `begins` (E,) on."""
-    counts = (counts + stride - 1).div(stride, rounding_mode="floor")
+def _every(begins: Tensor, counts: Tensor) -> Tensor:
+    """Return the `counts` (E,) rows from each of `begins` (E,) on."""
     number = torch.arange(int(counts.sum()), device=begins.device)
-    number -= (counts.cumsum(0) - counts).repeat_interleave(counts)
-    return number.mul_(stride).add_(begins.repeat_interleave(counts))
+    return number.add_((begins - (counts.cumsum(0) - counts)).repeat_interleave(counts))
 
 
 def take(values: Tensor, rows: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ from torch.utils.data import DataLoader
 from astra_data.core.errors import BadInputError, CorruptDatasetError, DiskError
 from astra_data.dataset import Dataset
 from astra_data.dataset.columns import INDEX, STATE
-from astra_data.dataset.frames import Frames, Order
+from astra_data.dataset.frames import Batches, Frames
 
 
 def test_columns_are_the_datasets(fake: Dataset) -> None:
@@ -57,15 +57,15 @@ def test_columns_are_mapped_where_their_share_of_the_memory_is_too_small(
 
 
 def test_faults_are_told_at_once(fake: Dataset, frames: Frames) -> None:
-    with pytest.raises(BadInputError, match="length 0, expected at least 1; stride -1, expected at least 1"):
-        frames.windows(0, stride=-1)
+    with pytest.raises(BadInputError, match="length 0, expected at least 1; past 1, expected 0 without padding"):
+        frames.windows(0, past=1)
     with pytest.raises(BadInputError, match=r"length 31, expected at most 30, the longest episode's, or padding"):
         frames.windows(31)
     assert len(frames.windows(30)) == 1
     with pytest.raises(BadInputError, match=r"past 6, expected 0 to 5"):
         frames.windows(6, past=6, padding="edge")
-    with pytest.raises(BadInputError, match=r"past 1, expected 0 without padding"):
-        frames.windows(6, past=1)
+    with pytest.raises(BadInputError, match="batches of 0 samples: expected at least 1"):
+        frames.windows(6).batches(0)
     with pytest.raises(BadInputError, match=r"padding 'wrap', expected 'valid' or 'edge'"):
         frames.windows(6, padding="wrap")  # type: ignore[arg-type]
     faults = "has no episode -1, expected 0 to 4; has no episode 5, .*; episode 2 is listed twice"
@@ -79,9 +79,8 @@ def test_faults_are_told_at_once(fake: Dataset, frames: Frames) -> None:
 
 def test_a_data_loader_draws_the_same_batches(frames: Frames) -> None:
     windows = frames.windows(6, padding="edge")
-    expected = list(windows.batches(8, seed=3))
-    order = windows.batches(8, seed=3).order
-    loader = DataLoader(windows, batch_sampler=order, collate_fn=lambda batch: batch)  # type: ignore[arg-type]
+    expected = list(windows.batches(8, shuffle=False))
+    loader = DataLoader(windows, 8, collate_fn=lambda batch: batch)
     found = list(loader)
     assert len(found) == len(expected) == len(loader)
     for ours, theirs in zip(expected, found, strict=True):
@@ -107,60 +106,54 @@ def test_an_interrupted_epoch_goes_on_where_it_was_left(frames: Frames) -> None:
         assert_equal(ours, theirs)
 
 
-def epoch(order: Order) -> list[int]:
-    return torch.cat(list(order)).tolist()
+def epoch(batches: Batches) -> list[int]:
+    return torch.cat([batch[INDEX] for batch in batches]).tolist()
 
 
-def test_an_epoch_holds_every_sample_once_in_an_order_of_its_own() -> None:
-    order = Order(1000, 32, seed=1)
-    epochs = [epoch(order) for _ in range(3)]
-    assert all(sorted(indices) == list(range(1000)) for indices in epochs)
+def test_an_epoch_holds_every_sample_once_in_an_order_of_its_own(frames: Frames) -> None:
+    steps = frames.transitions()
+    batches = steps.batches(32, seed=1)
+    epochs = [epoch(batches) for _ in range(3)]
+    assert all(sorted(indices) == list(range(sum(LENGTHS))) for indices in epochs)
     assert epochs[0] != epochs[1] != epochs[2] != epochs[0]
-    same, other = Order(1000, 7, seed=1), Order(1000, 32, seed=2)
-    assert epoch(same) == epochs[0] and epoch(other) != epochs[0]
-    assert abs(np.corrcoef(epochs[0], epochs[1])[0, 1]) < 0.2
+    assert epoch(steps.batches(7, seed=1)) == epochs[0] and epoch(steps.batches(32, seed=2)) != epochs[0]
 
 
-def test_without_shuffling_the_order_is_the_samples() -> None:
-    order = Order(10, 4, shuffle=False)
-    assert [batch.tolist() for batch in order] == [[0, 1, 2, 3], [4, 5, 6, 7], [8, 9]]
-    dropped = Order(10, 4, shuffle=False, drop_last=True)
-    assert [batch.tolist() for batch in dropped] == [[0, 1, 2, 3], [4, 5, 6, 7]]
-    assert (len(order), len(dropped)) == (3, 2)
+def test_without_shuffling_the_order_is_the_samples(frames: Frames) -> None:
+    batches = frames.transitions().batches(20, shuffle=False)
+    assert [batch[INDEX].tolist() for batch in batches] == [[*range(20)], [*range(20, 40)], [*range(40, 55)]]
+    assert len(batches) == 3
 
 
-def test_a_state_of_another_order_is_refused() -> None:
-    state = Order(20, 5, seed=4).state_dict()
-    for other in (state | {"count": 21}, state | {"seed": 0}, state | {"batch": 4}, state | {"epoch": -1}, {}):
+def test_a_state_of_another_order_is_refused(frames: Frames) -> None:
+    batches = frames.transitions().batches(20, seed=4)
+    state = batches.state_dict()
+    for other in (state | {"count": 21}, state | {"seed": 0}, state | {"batch": 3}, state | {"epoch": -1}, {}):
         with pytest.raises(BadInputError, match="the state is of another order of samples: expected"):
-            Order(20, 5, seed=4).load_state_dict(other)
+            batches.load_state_dict(other)
 
 
-@pytest.mark.parametrize("stride", [1, 3])
-def test_valid_windows_are_all_that_lie_inside_an_episode(fake: Dataset, frames: Frames, stride: int) -> None:
+def test_valid_windows_are_all_that_lie_inside_an_episode(fake: Dataset, frames: Frames) -> None:
     expected = [
         range(start + first, start + first + 6)
         for start, length in zip(fake.starts.tolist(), LENGTHS, strict=True)
-        for first in range(0, length - 5, stride)
+        for first in range(length - 5)
     ]
-    windows = frames.windows(6, stride=stride)
-    batch = everything(windows)
+    batch = everything(frames.windows(6))
     assert batch[INDEX].tolist() == [list(rows) for rows in expected] and not batch["is_pad"].any()
     for name in NAMES:
         np.testing.assert_array_equal(batch[name].numpy(), fake.columns([name])[name][batch[INDEX].numpy()])
 
 
-@pytest.mark.parametrize(("length", "stride", "past"), [(6, 1, 0), (6, 4, 5), (40, 1, 20), (1, 2, 0)])
-def test_edge_windows_repeat_the_first_and_last_step(
-    fake: Dataset, frames: Frames, length: int, stride: int, past: int
-) -> None:
+@pytest.mark.parametrize(("length", "past"), [(6, 0), (6, 5), (40, 20), (1, 0)])
+def test_edge_windows_repeat_the_first_and_last_step(fake: Dataset, frames: Frames, length: int, past: int) -> None:
     rows, is_pad = [], []
     for start, steps in zip(fake.starts, LENGTHS, strict=True):
-        for step in range(0, steps, stride):
+        for step in range(steps):
             wanted = np.arange(step - past, step - past + length)
             rows.append(start + np.clip(wanted, 0, steps - 1))
             is_pad.append((wanted < 0) | (wanted >= steps))
-    batch = everything(frames.windows(length, stride=stride, padding="edge", past=past))
+    batch = everything(frames.windows(length, padding="edge", past=past))
     np.testing.assert_array_equal(batch[INDEX].numpy(), rows)
     np.testing.assert_array_equal(batch["is_pad"].numpy(), is_pad)
     np.testing.assert_array_equal(batch[STATE].numpy(), fake.columns([STATE])[STATE][np.array(rows)])
