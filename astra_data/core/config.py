@@ -26,6 +26,7 @@ Seed = Annotated[int, Field(ge=0, lt=2**63)]
 
 _UNNAMED = ""
 _MOST_FAULTS = 5  # of a file that no user writes by hand
+_MOST_PARTS = 64  # of a key in TOML, between dots
 _EXPECTED = {
     "bool_type": "true or false",
     "float_type": "a number",
@@ -105,6 +106,11 @@ def load_tables(path: Path) -> dict[str, Any]:
         raise RecipeError(f"{path} is a folder: expected a TOML file") from None
     except (OSError, UnicodeDecodeError) as error:
         raise RecipeError(f"{path} cannot be read as a text file: {error}") from None
+    for number, line in enumerate(text.splitlines(), 1):
+        # The parser takes time with the square of a key's parts.
+        keys = re.split(r"[,=\[\]{}]", line.replace(" ", "").replace("\t", ""))
+        if any(len(list(filter(None, key.split(".")))) > _MOST_PARTS for key in keys):
+            raise RecipeError(f"{path} line {number}: a key of more than {_MOST_PARTS} parts")
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -114,12 +120,16 @@ def load_tables(path: Path) -> dict[str, Any]:
         raise RecipeError(f"{path}, line {at}: not valid TOML: {fault}") from None
     except ValueError as error:  # a number of more digits than Python takes
         raise RecipeError(f"{path} cannot be read as TOML: {error}") from None
+    except RecursionError:
+        raise RecipeError(f"{path} is nested too deeply") from None
 
 
 def validated[M: BaseModel](tables: Mapping[str, Any], model: type[M], origin: str) -> M:
     """Read `tables`, which come from `origin`, into `model` as `load_recipe` does."""
     try:
         return model.model_validate(_with_tuples(dict(tables)))
+    except RecursionError:
+        raise RecipeError(f"{origin} is nested too deeply") from None
     except ValidationError as error:
         faults = [_fault(details, model) for details in error.errors(include_url=False)]
     if len(faults) == 1:

@@ -115,8 +115,22 @@ def test_a_component_takes_its_own_settings_or_the_usual_ones() -> None:
         own_settings(Other(), usual)
 
 
-def test_a_number_that_python_does_not_take_is_refused(tmp_path: Path) -> None:
-    assert fault(tmp_path, "x = " + "9" * 5000).startswith("FILE cannot be read as TOML: Exceeds the limit")
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("x = " + "[" * 5000 + "]" * 5000, "is nested too deeply"),
+        ("x = " + "9" * 5000, "cannot be read as TOML: Exceeds the limit"),
+        (".".join("a" * 20_000) + " = 1", "recipe.toml line 1: a key of more than 64 parts"),
+        ("x = 1\n[" + " . ".join("a" * 65) + "]", "recipe.toml line 2: a key of more than 64 parts"),
+        ("x = {" + "'a'.\t" * 64 + "a = 1}", "recipe.toml line 1: a key of more than 64 parts"),
+    ],
+)
+def test_hostile_toml_is_one_line(tmp_path: Path, text: str, told: str) -> None:
+    path = tmp_path / "recipe.toml"
+    path.write_text(text)
+    with pytest.raises(RecipeError, match=told) as error:
+        load_recipe(path, Experiment)
+    assert "\n" not in str(error.value)
 
 
 def test_a_key_that_stands_below_a_table_by_mistake_is_told_where_it_belongs(tmp_path: Path) -> None:
