@@ -118,10 +118,23 @@ class McapFile:
                             f"{self._source}: its chunks are more than {MOST_UNPACKED} times as large as the file "
                             "once unpacked: if you trust it, pass a larger --max-bytes"
                         )
-                    yield from reading.breakup_chunk(record, validate_crc=True)
+                    yield from reading.breakup_chunk(self._unpacked(record), validate_crc=True)
             except (optional("mcap.exceptions").EndOfFile, struct.error):
                 if not self.is_cut:
                     raise
+
+    def _unpacked(self, chunk: Any) -> Any:
+        """Return a chunk unpacked as far as its header says, which the library does not hold to."""
+        data, most = chunk.data, chunk.uncompressed_size + 1
+        if chunk.compression == "zstd":
+            data = optional("zstandard").ZstdDecompressor().stream_reader(data, read_across_frames=True).read(most)
+        elif chunk.compression == "lz4":
+            data = optional("lz4.frame").LZ4FrameDecompressor().decompress(data, max_length=most)
+        elif chunk.compression:
+            raise BadInputError(f"{self._source}: chunks packed as {chunk.compression}, expected zstd or lz4")
+        if len(data) != chunk.uncompressed_size:
+            raise BadInputError(f"{self._source}: a chunk has another size than its header says: it is damaged")
+        return replace(chunk, compression="", data=data)
 
 
 def _content_bytes(stream: IO[bytes]) -> int:

@@ -1,10 +1,12 @@
 import re
+import struct
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from mcap_recordings import Message, command, ns, pose, write_json
 
@@ -43,7 +45,10 @@ WANTED = [number for number in range(LENGTH) if number % 5 and not 100 < number 
 FORMS: dict[str, dict[str, Any]] = {"usual": {}, "without chunks": {"use_chunking": False}}
 
 
-@pytest.mark.parametrize("compression", [CompressionType.ZSTD, CompressionType.LZ4])
+PACKED = [CompressionType.ZSTD, CompressionType.LZ4]
+
+
+@pytest.mark.parametrize("compression", PACKED)
 def test_no_more_is_unpacked_than_the_limit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compression: CompressionType
 ) -> None:
@@ -58,6 +63,21 @@ def test_no_more_is_unpacked_than_the_limit(
             continue
         with pytest.raises(BadInputError, match=r"once unpacked: if you trust it, pass a larger --max-bytes"):
             list(file.messages())
+
+
+@pytest.mark.parametrize("compression", PACKED)
+@pytest.mark.parametrize("declared", [0, 100, 10**6])
+def test_a_chunk_is_unpacked_as_far_as_it_says(tmp_path: Path, compression: CompressionType, declared: int) -> None:
+    path = write(tmp_path / "log.mcap", compression=compression)
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    content = bytearray(path.read_bytes())
+    start = summary.chunk_indexes[0].chunk_start_offset + 9 + 16
+    content[start : start + 8] = struct.pack("<Q", declared)
+    path.write_bytes(content)
+    with pytest.raises(BadInputError, match="has another size than its header says"):
+        numbers(path)
 
 
 def test_the_index_tells_of_missing_topics_before_anything_is_read(tmp_path: Path) -> None:
