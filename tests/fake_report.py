@@ -18,11 +18,10 @@ COMMAND = "astra-data run recipes/antmaze_u.toml"
 
 
 def task(**changes: object) -> SimpleNamespace:
-    usual = {
+    usual: dict[str, object] = {
         "name": "antmaze-u",
         "photograph": None,
-        "maze": U_MAZE,
-        "plane": object(),
+        "plane": U_MAZE,
         "ball_index": None,
         "facts": {},
         "timestep_s": 0.1,

@@ -249,7 +249,7 @@ def _has_both(fails: Tensor) -> bool:
 
 
 def _untrained(task: Task, grounding: Grounding, training: PairedEpisodes, *, sees_latent: bool) -> FailureModel:
-    windows, maze, encoder = training.windows, task.objective.layout, grounding.encoder
+    windows, maze, encoder = training.windows, task.plane, grounding.encoder
     shape = FailureShape(
         state_size=windows.state.shape[-1],
         action_size=windows.action.shape[-1],

@@ -83,7 +83,7 @@ def pairing_named(name: str) -> Pairing:
         return Pairing(
             id=made.simulator_id,
             origin={"task": made.name, **file_of(name)},
-            maze=None if made.plane is None else made.maze,
+            maze=made.plane,
             abstract_state=made.abstract_state,
             abstraction=made.abstraction,
             simulator=made.own_simulator,

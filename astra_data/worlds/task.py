@@ -229,13 +229,6 @@ class Varied:
     wide: Variation  # what COMPASS varies or identifies, and RMA adapts to, of the kind of all parameters
 
 
-@dataclass(frozen=True)
-class Plane:
-    """Properties that only tasks in a maze have."""
-
-    wall_reach_m: float  # a robot whose clearance in the maze is larger than this touches no wall
-
-
 _DERIVED: Any = None  # from other fields
 
 
@@ -260,7 +253,7 @@ class Task:
         facts: what datasets record about the target environment.
         simulator_id: names the abstract simulator in datasets, by default after its class.
         varied: the same simulator with parameters that vary, by default what reaches it of the commands.
-        plane: properties of a task in a maze; None for others.
+        wall_reach_m: a robot whose clearance in the maze is larger than this touches no wall.
         photograph: renders target states (K, S) as pictures (K, height, width, 3).
         target_id: name of a target that several tasks share, so that episodes of one serve all.
         derived: the defaults that were filled in, by field: `dataclasses.replace` fills them in anew.
@@ -292,7 +285,7 @@ class Task:
     facts: Mapping[str, str | float] = field(default_factory=dict)
     simulator_id: str = ""
     varied: Varied = Varied(VariedCommands, RANDOMIZED_COMMANDS, RANDOMIZED_COMMANDS)
-    plane: Plane | None = None
+    wall_reach_m: float = 0.0
     photograph: Callable[[Floats], NDArray[np.uint8]] | None = None
     target_id: str | None = None
     derived: Mapping[str, Any] = field(default_factory=dict, repr=False, compare=False)
@@ -369,22 +362,19 @@ class Task:
         return self.robot is not None or self.make_target is not None
 
     @property
-    def planar(self) -> Plane:
-        """The properties of a task in a maze; BadInputError for others."""
-        return self._in_maze(self.plane)
+    def plane(self) -> Maze | None:
+        """The maze; None where there is none."""
+        return self.objective.layout
 
     @property
     def maze(self) -> Maze:
         """The maze; BadInputError where there is none."""
-        return self._in_maze(self.objective.layout)
-
-    def _in_maze[Found](self, found: Found | None) -> Found:
-        if found is None:
+        if self.plane is None:
             raise BadInputError(
                 f"expected a task in a maze, got '{self.name}', which has none: leave out what needs a maze "
                 "(augment, follower, support_penalty, command_limit, clearance_m, start 'anywhere')"
             )
-        return found
+        return self.plane
 
     @property
     def ball_index(self) -> int | None:

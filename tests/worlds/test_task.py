@@ -43,10 +43,9 @@ ANT, WALKER, KICK = (TASKS[name] for name in ("antmaze-umaze", "humanoid-walker2
 
 
 def test_what_needs_a_maze_is_refused_where_there_is_none() -> None:
-    assert ANT.maze is U_MAZE and ANT.planar is ANT.plane
+    assert ANT.maze is ANT.plane is U_MAZE
     asked: list[Callable[[], object]] = [
         lambda: WALKER.maze,
-        lambda: WALKER.planar,
         lambda: WallWatch(WALKER, 0.2),
         lambda: careful(WALKER, torch.zeros(1, 0)),
     ]

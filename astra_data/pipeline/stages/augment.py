@@ -203,9 +203,8 @@ def augment(
     """
     source = open_dataset(dataset)
     world = _task_of(source, task)
-    plane = world.planar
     _check(source, world)
-    margin_m = plane.wall_reach_m if config.margin_m is None else config.margin_m
+    margin_m = world.wall_reach_m if config.margin_m is None else config.margin_m
     relocation = Relocation(world, config.rotations, config.translations, margin_m, config.min_steps)
     held_out, copies = _shares(source, relocation, config, seed)
     if source.cameras:

@@ -175,7 +175,7 @@ def _name(pairing: Pairing, entry: int) -> str:
 def _check(source: Dataset, pairing: Pairing) -> None:
     task = source.description["environment"].get("id")
     known = TASKS.get(task)
-    if pairing.maze is not None and known and known.plane is not None and known.maze != pairing.maze:
+    if pairing.maze is not None and known and known.plane not in (None, pairing.maze):
         raise BadInputError(
             f"{source.reference} was collected for {task}, which has another maze than "
             f"{pairing.origin['task']}: give --simulator {task}"

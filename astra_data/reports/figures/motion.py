@@ -64,7 +64,7 @@ RIM = 0.35  # visible width of the outer walls, in cells
 @style()
 def trajectories(results: Results, scene: Scene) -> Figure | None:
     """Draw the plane once per method: dashed in the simulator, solid where tested; failures end with a cross."""
-    maze = scene.task.maze if scene.task.plane else None
+    maze = scene.task.plane
     panels = {row: _walked(folder, scene.episodes) for row, folder in scene.folders(results).items()}
     found = [path.reshape(-1, 2) for paths, _ in panels.values() for path, *_ in paths]
     points = np.concatenate([*found, np.empty((0, 2))])

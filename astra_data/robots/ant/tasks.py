@@ -18,7 +18,7 @@ from astra_data.worlds.plane.navigation import Navigation, PlanarObjective, Plan
 from astra_data.worlds.plane.point_mass import PointMass, VariedPlanar
 from astra_data.worlds.protocols import Step, rows_in
 from astra_data.worlds.simulators import BatchedPhysics, PhysicsTarget, add_walls, wall_geoms
-from astra_data.worlds.task import PLANAR_GOAL, PLANAR_STATE, Plane, Task, Varied, column, entries, free_body
+from astra_data.worlds.task import PLANAR_GOAL, PLANAR_STATE, Task, Varied, column, entries, free_body
 from astra_data.worlds.variation import RANDOMIZED_ACTIONS, WIDE_RANGES
 
 STATE_SIZE = 29  # qpos (15): x, y, z, quaternion, 8 joint angles; qvel (14): linear, angular, 8 joint rates
@@ -226,7 +226,7 @@ def _antmaze(name: str, maze: Maze, horizon: int) -> Task:
         simulator_id="point_mass",
         facts={"integrator": INTEGRATOR, "leg_scale": 1.0},
         varied=Varied(VariedPlanar, RANDOMIZED_ACTIONS, WIDE_RANGES),
-        plane=Plane(wall_reach_m=WALL_REACH_M),
+        wall_reach_m=WALL_REACH_M,
     )
 
 

@@ -19,7 +19,7 @@ from astra_data.worlds.plane.mazes import FIELD, S_MAZE
 from astra_data.worlds.plane.navigation import Navigation, PlanarObjective, PlanarTarget
 from astra_data.worlds.plane.point_mass import PointMass, VariedPlanar
 from astra_data.worlds.protocols import Step, rows_in
-from astra_data.worlds.task import PLANAR_GOAL, PLANAR_STATE, ColumnEntry, Plane, Task, Varied, column, entries
+from astra_data.worlds.task import PLANAR_GOAL, PLANAR_STATE, ColumnEntry, Task, Varied, column, entries
 from astra_data.worlds.variation import RANDOMIZED_ACTIONS, WIDE_RANGES, BallVariation
 
 
@@ -363,7 +363,7 @@ def _task(*, ball: bool, **own: Any) -> Task:
         quantities=_QUANTITIES | (_BALL_QUANTITIES if ball else {}),
         timestep_s=CONTROL_STEP_S,
         facts={"stand_in": "mujoco", "tick_s": TICK_S},
-        plane=Plane(wall_reach_m=0.3),
+        wall_reach_m=0.3,
         **own,
     )
 

@@ -20,6 +20,7 @@ from astra_data.pipeline.stages import collect as suboptimal
 from astra_data.pipeline.stages.collect import CollectConfig, PolicyBehavior, WallWatch, collect, record
 from astra_data.policies.running_policy import PolicyFile, running
 from astra_data.robots.registry import TASKS
+from astra_data.worlds.task import Task
 
 TINY = CollectConfig(episodes=3, max_steps=15)
 
@@ -111,7 +112,7 @@ def test_episodes_begin_where_the_task_does_or_by_default_anywhere_in_a_maze(
     start: str | None, has_maze: bool, anywhere: bool, task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if not has_maze:
-        monkeypatch.setitem(TASKS, task, replace(TASKS[task], plane=None))
+        monkeypatch.setattr(Task, "plane", None)
     config = TINY.model_copy(update={"start": start, "max_steps": 1})
     collect(task, config, seed=0, out=tmp_path / "out", progress=silent)
     position = Dataset.open(tmp_path / "out").columns([STATE])[STATE][:, :2]
