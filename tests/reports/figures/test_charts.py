@@ -4,8 +4,7 @@ from typing import Any
 import numpy as np
 import pytest
 from fake_dataset import write_fake
-from figures_shown import legend
-from matplotlib.figure import Figure
+from figures_shown import drawn, legend
 
 from astra_data.reports.figures.charts import data_efficiency, learning_curves, on_one_grid, score_bars
 from astra_data.reports.figures.style import Scene
@@ -27,11 +26,6 @@ def line(row: str, seed: int, where: str = TESTED, percent: int = 100, **values:
 @pytest.fixture
 def scene(tmp_path: Path) -> Scene:
     return Scene(tmp_path, TASKS["antmaze-umaze"])
-
-
-def drawn(figure: Figure | None) -> Figure:
-    assert figure is not None
-    return figure
 
 
 def test_bars_show_mean_interval_seeds_and_the_own_simulator(scene: Scene) -> None:

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from figures_shown import drawn
 from matplotlib.colors import to_hex
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from safetensors.numpy import save_file
 from small_cart import TASK
@@ -71,11 +71,6 @@ def write(
     tensors["target.state"] = np.zeros((40, 4))
     (folder / "evaluation.json").write_text(json.dumps(values))
     save_file(tensors, folder / "trajectories.safetensors")
-
-
-def drawn(figure: Figure | None) -> Figure:
-    assert figure is not None
-    return figure
 
 
 @pytest.fixture
