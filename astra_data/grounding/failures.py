@@ -111,6 +111,12 @@ class FailureModel(nn.Module):
             seen.append(latent[..., : self.shape.latent_size])
         return torch.cat(seen, dim=-1), torch.cat([state, landed, action, averages], dim=-1)
 
+    def recorded_clearances(self, windows: PairedWindows) -> Tensor:
+        """Return the distances (E, T, 11) in m from walls of recorded steps."""
+        moved = torch.zeros_like(windows.state)
+        moved[:, 1:] = windows.state.diff(dim=1)
+        return self._clearances(windows.state, windows.simulated_next - windows.state, moved)
+
     def _clearances(self, state: Tensor, *moves: Tensor) -> Tensor:
         """Return distances (..., 11) in m to the nearest wall, as far as it matters, here and along `moves`."""
         seconds = torch.tensor(AHEAD_S, device=state.device)[:, None]
@@ -286,7 +292,10 @@ def _drawn(rows: Tensor, count: int) -> Tensor:
 
 @torch.no_grad()
 def replayed_inputs(task: Task, grounding: Grounding, failures: FailureModel, episodes: PairedEpisodes) -> Tensor:
-    """Return what is seen of each step (E, T, I) in simulated replays, by the one that began longest before it."""
+    """Return what is seen of each step (E, T, I): walls as recorded, all else in simulated replays.
+
+    A step is seen by the replay that began longest before it.
+    """
     windows = episodes.windows
     moments = Moments.every(windows, RISK_STEPS)
     simulator = grounding.simulator(task, len(moments), str(windows.mask.device))
@@ -305,6 +314,11 @@ def replayed_inputs(task: Task, grounding: Grounding, failures: FailureModel, ep
         real = now == moments.first + count
         # A replay that began earlier comes to a step later, and replaces what was seen of it.
         replayed[moments.episode[real], now[real]] = inputs[real]
+    if failures.clearance.numel():
+        # Replays drift, which blurs how near a wall is too near.
+        first = _MAGNITUDES + _AVERAGES
+        walls = failures.recorded_clearances(windows)
+        replayed[..., first : first + walls.shape[-1]] = walls
     return replayed
 
 

@@ -351,6 +351,22 @@ def test_walls_are_seen_where_the_robot_and_where_the_simulator_goes() -> None:
     assert made.inputs(*step)[0][0, 20:].tolist() == [3.0] * 11  # beyond, walls are alike
 
 
+def test_walls_are_those_of_the_recorded_steps() -> None:
+    """And not of replays, which have drifted."""
+    episodes = hurried(3, 0)
+    windows, failures = episodes.windows, failure_model(has_maze=True, latent_size=8)
+    seen = replayed_inputs(TASK, GROUNDING, failures, episodes)
+    for episode, step in ((0, 0), (1, 60), (2, 99)):
+        here, landed, action = (
+            of[episode, step][None] for of in (windows.state, windows.simulated_next, windows.action)
+        )
+        memory = failures.initial_memory(windows.state[episode, max(step - 1, 0)][None], action)
+        inputs, _ = failures.inputs(here, action, landed, torch.zeros(1, 8), memory)
+        torch.testing.assert_close(seen[episode, step, 20:31], inputs[0, 20:31])
+        if step:
+            assert not torch.allclose(seen[episode, step, :20], inputs[0, :20], rtol=0.01)
+
+
 def test_log_odds_are_scaled_and_shifted_to_what_happens() -> None:
     """Two members say twice and four times too much of events whose log-odds they know."""
     torch.manual_seed(0)

@@ -54,7 +54,7 @@ def test_logs_become_policies_and_a_page_without_a_target(cart: Path) -> None:
         assert evaluation.outcomes == evaluation.grounded and evaluation.raw is not None
     assert evaluation.grounded != evaluation.simulated
     page = (folder / "report/results.md").read_text().splitlines()
-    assert page[2].startswith("**Nothing was tested on a robot: the task has no target.** All methods were tested")
+    assert page[2].startswith("> **Nothing was tested on a robot: the task has no target.** All methods were tested")
     assert "in which only NAS trained" in page[2]
     text = "\n".join(page[3:])
     assert "over seeds, in the simulator grounded by NAS" in text and "n the target." not in text
