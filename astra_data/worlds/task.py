@@ -230,6 +230,7 @@ class Varied:
 
 
 _DERIVED: Any = None  # from other fields
+_BALL = "ball_position_m"  # the quantity of what the robot kicks or pushes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -323,6 +324,9 @@ class Task:
         if not 0 < self.timestep_s < 2:
             expected = "expected above 0 and below 2 s, since datasets have a whole number of steps per second"
             faults.append(f"timestep_s: {expected}: got {self.timestep_s}")
+        ball = (self.quantities or {}).get(_BALL)
+        if ball is not None and (not ball or ball[0] < 0 or [*ball] != [ball[0], ball[0] + 1]):
+            faults.append(f"quantities: {_BALL}: expected two indices in a row, of x and y, got {ball}")
         if not NAME.fullmatch(self.name):
             faults.append("name: expected letters, digits, '.', '_' and '-', since datasets are named after it")
         if faults:
@@ -379,8 +383,8 @@ class Task:
     @property
     def ball_index(self) -> int | None:
         """Index in abstract states of the ball's x; None where there is no ball."""
-        ball = self.quantities.get("ball_position_m")
-        return ball[0] if ball else None
+        ball = self.quantities.get(_BALL, ())
+        return ball[0] if len(ball) == 2 else None
 
     @property
     def fps(self) -> int:

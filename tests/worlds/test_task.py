@@ -1,3 +1,4 @@
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
@@ -104,6 +105,23 @@ def test_what_was_given_stays_where_a_field_is_replaced() -> None:
         for name in given.keys() - {"abstract_state"}:
             assert getattr(other, name) is given[name]
         assert other.abstract_state == replace(given["abstract_state"], name="abstract.state")
+
+
+@pytest.mark.parametrize("given", [(), (0,), (1, 0), (0, 2), (-2, -1), (0, 1, 2)])
+def test_a_ball_is_at_two_indices_in_a_row(given: tuple[int, ...]) -> None:
+    wanted = f"quantities: ball_position_m: expected two indices in a row, of x and y, got {re.escape(str(given))}"
+    with pytest.raises(BadInputError, match=wanted):
+        replace(ANT, quantities={"ball_position_m": given})
+    assert replace(ANT, quantities={"ball_position_m": (2, 3)}).ball_index == 2 and ANT.ball_index is None
+
+
+def test_a_ball_on_a_beam_has_no_place_in_a_plane() -> None:
+    class Beam(Rail):
+        abstract_state = Column("abstract.state", size=1, names=("ball_position",), astra={"unit": ["m"]})
+
+    task = replace(TASK, make_simulator=Beam)
+    assert task.quantities == {"ball_position_m": (0,)} and task.ball_index is None
+    assert replace(task, name="beam").ball_index is None
 
 
 def test_simulators_of_a_task_take_actions_and_commands() -> None:
