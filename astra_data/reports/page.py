@@ -101,9 +101,11 @@ def _facts(results: Results) -> Iterator[Block]:
         for percent in results.percents
         if (lacking := [row for row in results.rows if row not in results.tested(percent)])
     ]
-    asked = results.settings.get("seeds")
-    if lacking := [f"{seed}" for seed in asked if seed not in results.seeds] if isinstance(asked, list) else []:
-        unfinished.append(f"seeds {', '.join(lacking)}")
+    asked, sweep = results.settings.get("seeds"), results.settings.get("sweep")
+    sizes = sweep.get("percent") if isinstance(sweep, dict) else None
+    for words, wanted, made in (("{} % of the data", sizes, results.percents), ("seeds {}", asked, results.seeds)):
+        if lacking := [str(one) for one in wanted if one not in made] if isinstance(wanted, list) else []:
+            unfinished.append(words.format(", ".join(lacking)))
     if unfinished:
         text += f" Not finished yet: {'; '.join(unfinished)}."
     yield Text(text)

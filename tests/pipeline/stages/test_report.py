@@ -193,14 +193,18 @@ def test_sizes_are_set_side_by_side(rough: None, tmp_path: Path, monkeypatch: py
     # At 50 % one seed of ASTRA is worse.
     path = root / artifact_key("evaluate", "astra", 2, 50) / "evaluation.json"
     edit_json(path, target=outcomes([0, 0, 0, 0], 2))
-    sized = FakeRecipe("sizes", methods=("direct_transfer", "astra"), percents=(10, 100, 50))
+    asked = {"seeds": [*SEEDS, 7], "sweep": {"percent": [10, 100, 50]}}
+    sized = FakeRecipe("sizes", methods=("direct_transfer", "astra"), percents=(10, 100, 50), settings=asked)
     found = make(root, tmp_path / "results", sized)
     assert found.percents == [50, 100]
     html = read_page((root / "report/results.html").read_text())
     head, direct, astra = html.table("Success in the target, mean")
     assert (head, astra) == (["method", "50 %", "100 %"], ["ASTRA", "0.25 ± 0.25", "0.50 ± 0.25"])
     assert direct == ["Direct transfer", "-", "0.12 ± 0.18 (2 of 3 seeds)"]
-    assert "Not finished yet: Direct transfer at 50 %." in html.text and "data_efficiency" in images(root / "report")
+    assert (
+        "Not finished yet: Direct transfer at 50 %; 10 % of the data; seeds 7." in html.text
+        and "data_efficiency" in images(root / "report")
+    )
     assert (tmp_path / "results/sizes/data_efficiency.png").exists()
 
 
