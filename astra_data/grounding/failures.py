@@ -94,9 +94,18 @@ class FailureModel(nn.Module):
         return torch.cat([state, state, previous_action, averages], dim=-1)
 
     def inputs(
-        self, state: Tensor, action: Tensor, landed: Tensor, latent: Tensor | None, memory: Tensor
+        self,
+        state: Tensor,
+        action: Tensor,
+        landed: Tensor,
+        latent: Tensor | None,
+        memory: Tensor,
+        walls: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Return what networks see of a step, (B, I), and the next memory (B, M); simulators `landed` (B, X)."""
+        """Return what networks see of a step, (B, I), and the next memory (B, M); simulators `landed` (B, X).
+
+        In a maze, `walls` (B, 11) are the distances from walls, by default those of this step.
+        """
         before, landed_before, action_before, averages = memory.split(self._parts, dim=-1)
         wanted, moved, missed = landed - state, state - before, state - landed_before
         moves = (wanted / self.wanted_std, moved / self.moved_std, missed / self.missed_std)
@@ -106,7 +115,7 @@ class FailureModel(nn.Module):
         averages = (now + self.rates * (magnitudes.unsqueeze(-2) - now)).flatten(-2)
         seen = [magnitudes, averages]
         if self.clearance.numel():
-            seen.append(self._clearances(state, wanted, moved))
+            seen.append(self._clearances(state, wanted, moved) if walls is None else walls)
         if latent is not None:
             seen.append(latent[..., : self.shape.latent_size])
         return torch.cat(seen, dim=-1), torch.cat([state, landed, action, averages], dim=-1)
@@ -305,20 +314,18 @@ def replayed_inputs(task: Task, grounding: Grounding, failures: FailureModel, ep
     state = moments.state
     memory = failures.initial_memory(state, moments.previous_action)
     replayed = state.new_zeros(*windows.mask.shape, failures.shape.input_size)
+    # Replays drift, which blurs how near a wall is too near.
+    walls = failures.recorded_clearances(windows) if failures.clearance.numel() else None
     for count in range(_REPLAYED):
         now, action = moments.after(count), moments.action(count)
         latent = simulator.latent
         simulator.step(action)
-        inputs, memory = failures.inputs(state, action, simulator.landed, latent, memory)
+        near = None if walls is None else walls[moments.episode, now]
+        inputs, memory = failures.inputs(state, action, simulator.landed, latent, memory, near)
         state = simulator.state
         real = now == moments.first + count
         # A replay that began earlier comes to a step later, and replaces what was seen of it.
         replayed[moments.episode[real], now[real]] = inputs[real]
-    if failures.clearance.numel():
-        # Replays drift, which blurs how near a wall is too near.
-        first = _MAGNITUDES + _AVERAGES
-        walls = failures.recorded_clearances(windows)
-        replayed[..., first : first + walls.shape[-1]] = walls
     return replayed
 
 
