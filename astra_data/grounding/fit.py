@@ -188,7 +188,6 @@ def _optimize(model: "GroundingModel", weights: "LossWeights", fitting: Fitting)
             fitting.progress(descent.share, note)
     descent.finish()
     return {
-        "windows_per_second": descent.done * config.batch_windows / descent.stopwatch.seconds,
         "stopwatch": descent.stopwatch,
         "parameters": sum(parameter.numel() for parameter in descent.parameters),
         "window": window,

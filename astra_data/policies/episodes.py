@@ -215,7 +215,6 @@ class TargetEpisodes(NamedTuple):
 
     outcome: Outcome
     filmed: Tensor  # the states (T + 1, S) of the first
-    rate: float  # target steps/s
     start_goal: dict[str, Tensor]  # where they began, "start" (B, 2) or with balls (B, 4), and "goal" (B, G)
 
 
@@ -257,7 +256,7 @@ def in_target(
         progress((step + 1) / task.objective.horizon * 0.99, f"{rate:,.0f} target steps/s")
         if not record.active.any():
             break
-    return TargetEpisodes(record.outcome(), torch.stack(filmed), rate, start_goal)
+    return TargetEpisodes(record.outcome(), torch.stack(filmed), start_goal)
 
 
 def judged_success(task: Task, judge: Grounding, policy: RunningPolicy, episodes: int, seed: int) -> float:

@@ -1,7 +1,6 @@
 """What a learner of the user's makes; the base of those that act in an environment: seeded iterations, checkpoints."""
 
 import math
-import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from statistics import fmean
@@ -74,7 +73,6 @@ class Learner(ABC):
         self.total_steps, self.rollout_steps, self.steps = total_steps, rollout_steps, 0
         # Of the training that is done, which schedules follow; at a pace of 2 half of the steps that are left remain.
         self.share, self.pace = 0.0, 1.0
-        self.world_seconds = 0.0  # that the environment's steps took, since the start or since resuming
         self._parts, self._seed, self._iteration = parts, seed, 0
         self.observation = env.reset()  # to act on next
         device = self.observation.device
@@ -93,9 +91,7 @@ class Learner(ABC):
 
         Return the step, the action clipped to ±1, and which rows (B,) reached the horizon, and which ended.
         """
-        began = time.perf_counter()
         step = self.env.step(action)
-        self.world_seconds += time.perf_counter() - began
         self.age, self.lasted = self.age + 1, self.lasted + 1
         expired = (self.age >= self.horizon) & ~step.terminated
         done = step.terminated | expired

@@ -178,7 +178,7 @@ def optimize(learner: Learner, env: TrainingEnv, training: Training, checkpoint:
         learner.load_state_dict(state["learner"], env.load_state_dict(world), goes_on=bool(world))
 
     logbook = Logbook(training.folder / checkpoint, go_on)
-    points, stopwatch, first = logbook.points, logbook.stopwatch, learner.steps
+    points, stopwatch = logbook.points, logbook.stopwatch
     is_lasting = training.task.objective.is_lasting
     ramps = training.is_plus and isinstance(learner, Ppo) and not is_lasting
     while not learner.done:
@@ -196,13 +196,7 @@ def optimize(learner: Learner, env: TrainingEnv, training: Training, checkpoint:
         training.progress(learner.share, note)
         if logbook.is_due or learner.done:
             logbook.keep({"learner": learner.state_dict(), "world": env.state_dict()})
-    taken, seconds = learner.steps - first, learner.world_seconds
-    return {
-        "steps_per_second": learner.steps / stopwatch.seconds,
-        "simulator_steps_per_second": taken / seconds if taken else None,
-        **stopwatch.spent(),
-        "points": points,
-    }
+    return {**stopwatch.spent(), "points": points}
 
 
 class TargetConfig(Config):

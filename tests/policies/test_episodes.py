@@ -92,7 +92,7 @@ def test_episodes_end_in_success_in_failure_or_with_their_time() -> None:
     other = in_target(CART, lambda goal: driving(3.5), 5, seed=4)
     assert torch.equal(late.start_goal["goal"], tipped.start_goal["goal"])
     assert not torch.equal(other.start_goal["goal"], tipped.start_goal["goal"])
-    assert late.filmed.shape == (CART.objective.horizon + 1, 2) and tipped.filmed.shape == (2, 2) and late.rate > 0
+    assert late.filmed.shape == (CART.objective.horizon + 1, 2) and tipped.filmed.shape == (2, 2)
 
 
 @pytest.mark.parametrize("task", [CART, TASKS["nao-navigation"], TASKS["humanoid-walker2d"]])

@@ -129,7 +129,7 @@ def evaluate(
             measures = [score.measure for score in world.objective.scores]
             results["encoders"] = {kind: {one: fmean(of[one]) for one in measures} for kind, of in outcomes.items()}
         headline = tested[row.headline]
-        results |= {"target": headline.outcome.to_json(), "target_steps_per_second": headline.rate}
+        results["target"] = headline.outcome.to_json()
         tensors = {"target.position": headline.outcome.position} | headline.start_goal
         if world.photograph is not None:
             tensors["target.state"] = headline.filmed

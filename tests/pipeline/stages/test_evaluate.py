@@ -107,7 +107,7 @@ def test_a_policy_is_tested_in_both_worlds_and_with_both_encoders(
     inputs = {"policy": trained, "grounding": grounded, "target_encoder": good}
     told, paths = make(task, "astra", tmp_path / "astra", inputs)
     keys = {"task", "method", "seed", "episodes", "dataset_version", "dataset_hash", "wall_seconds"}
-    keys |= {"cpu_seconds", "target_steps_per_second", "encoder", "target", "simulated", "encoders", "raw"}
+    keys |= {"cpu_seconds", "encoder", "target", "simulated", "encoders", "raw"}
     keys |= {"git_commit", "packages", "machine", "leg_scale", "finished_at"}
     assert told.keys() == keys
     assert (told["method"], told["seed"], told["episodes"], told["encoder"]) == ("astra", 0, 3, "target")
