@@ -159,23 +159,29 @@ Points = Sequence[Mapping[str, float | None]]
 
 _RECENT = 5  # points of the learning curve over which success is averaged
 MASTERED = 0.95  # success of training episodes from which on a simulator counts as mastered
+LEARNED = 0.8  # success from which on a policy counts as trained
 FAST = 6.0  # pace of a training that has mastered its simulator, of one that has not
 _GROWTH_SHARE = 0.25  # share of the training over which penalties grow from 0 to full size
+_PATIENCE_SHARE = 0.4  # share of the training after which they no longer wait for a simulator that is not mastered
 
 
-def is_mastered(points: Points) -> bool:
-    """Return whether the last training episodes succeed as often as `MASTERED`."""
+def recent_success(points: Points) -> float:
+    """Return the mean success of the last training episodes; 0 if none has ended."""
     recent = [success for point in points[-_RECENT:] if (success := point.get("success")) is not None]
-    return bool(recent) and fmean(recent) >= MASTERED
+    return fmean(recent) if recent else 0.0
 
 
 def penalty_scale(points: Points) -> float:
-    """Return the factor on penalties (0 to 1) after `points`: grows while mastered, else falls; else robots stand."""
+    """Return the factor on penalties (0 to 1) after `points`: grows while episodes succeed, else falls.
+
+    With penalties from the start, robots learn to stand.
+    """
     scale, before = 0.0, 0.0
     for number, point in enumerate(points, 1):
         now = float(point["share"] or 0.0)
         change = (now - before) / _GROWTH_SHARE
-        scale += change if is_mastered(points[max(0, number - _RECENT) : number]) else -change
+        needed = MASTERED if now < _PATIENCE_SHARE else LEARNED
+        scale += change if recent_success(points[max(0, number - _RECENT) : number]) >= needed else -change
         scale, before = min(1.0, max(0.0, scale)), now
     return scale
 

@@ -21,7 +21,16 @@ from astra_data.grounding.files import grounding_at
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.simulator import Grounding
 from astra_data.policies.episodes import ObservedTargetEnv, Reached, reached_in_own_world
-from astra_data.policies.learner import FAST, Learner, SavedPolicy, is_mastered, lately, penalty_scale
+from astra_data.policies.learner import (
+    FAST,
+    LEARNED,
+    MASTERED,
+    Learner,
+    SavedPolicy,
+    lately,
+    penalty_scale,
+    recent_success,
+)
 from astra_data.policies.ppo import Ppo, PpoConfig
 from astra_data.policies.running_policy import POLICY, Observed, PolicyFile
 from astra_data.policies.sac import Sac, SacConfig
@@ -59,7 +68,7 @@ class TrainConfig(Config):
     tries: AtOnce = 2
     """Maximum number of training runs. A policy that does not master its own simulator (in 100 episodes from
     the task's starts, acting by the mean of its actions) is trained again with another seed, twice as long."""
-    least_success: Share = 0.8
+    least_success: Share = LEARNED
     """Success in these episodes at which a simulator is mastered; if no try reaches it, the best one is kept."""
 
 
@@ -183,7 +192,7 @@ def optimize(learner: Learner, env: TrainingEnv, training: Training, checkpoint:
     ramps = training.is_plus and isinstance(learner, Ppo) and not is_lasting
     while not learner.done:
         env.penalty_scale = penalty_scale(points) if ramps else 1.0
-        learner.pace = FAST if env.penalty_scale == 1.0 and is_mastered(points) else 1.0
+        learner.pace = FAST if env.penalty_scale == 1.0 and recent_success(points) >= MASTERED else 1.0
         metrics = learner.iterate()
         # JSON has no NaN: undefined figures, such as the success rate of no episodes, are null.
         known = {name: None if math.isnan(value) else value for name, value in metrics.items()}
