@@ -158,11 +158,11 @@ class Learner(ABC):
 Points = Sequence[Mapping[str, float | None]]
 
 _RECENT = 5  # points of the learning curve over which success is averaged
-MASTERED = 0.95  # success of training episodes from which on a simulator counts as mastered
-LEARNED = 0.8  # success from which on a policy counts as trained
-FAST = 6.0  # pace of a training that has mastered its simulator, of one that has not
+MASTERED = 0.8  # success at which a simulator is mastered
+NEARLY_ALWAYS = 0.95  # success of training episodes from which on little is left to learn
+FAST = 6.0  # pace of a training then
 _GROWTH_SHARE = 0.25  # share of the training over which penalties grow from 0 to full size
-_PATIENCE_SHARE = 0.4  # share of the training after which they no longer wait for a simulator that is not mastered
+_PATIENCE_SHARE = 0.4  # share of the training after which they wait for no more than a mastered simulator
 
 
 def recent_success(points: Points) -> float:
@@ -180,7 +180,7 @@ def penalty_scale(points: Points) -> float:
     for number, point in enumerate(points, 1):
         now = float(point["share"] or 0.0)
         change = (now - before) / _GROWTH_SHARE
-        needed = MASTERED if now < _PATIENCE_SHARE else LEARNED
+        needed = NEARLY_ALWAYS if now < _PATIENCE_SHARE else MASTERED
         scale += change if recent_success(points[max(0, number - _RECENT) : number]) >= needed else -change
         scale, before = min(1.0, max(0.0, scale)), now
     return scale

@@ -23,8 +23,8 @@ from astra_data.grounding.simulator import Grounding
 from astra_data.policies.episodes import ObservedTargetEnv, Reached, reached_in_own_world
 from astra_data.policies.learner import (
     FAST,
-    LEARNED,
     MASTERED,
+    NEARLY_ALWAYS,
     Learner,
     SavedPolicy,
     lately,
@@ -68,7 +68,7 @@ class TrainConfig(Config):
     tries: AtOnce = 2
     """Maximum number of training runs. A policy that does not master its own simulator (in 100 episodes from
     the task's starts, acting by the mean of its actions) is trained again with another seed, twice as long."""
-    least_success: Share = LEARNED
+    least_success: Share = MASTERED
     """Success in these episodes at which a simulator is mastered; if no try reaches it, the best one is kept."""
 
 
@@ -192,7 +192,7 @@ def optimize(learner: Learner, env: TrainingEnv, training: Training, checkpoint:
     ramps = training.is_plus and isinstance(learner, Ppo) and not is_lasting
     while not learner.done:
         env.penalty_scale = penalty_scale(points) if ramps else 1.0
-        learner.pace = FAST if env.penalty_scale == 1.0 and recent_success(points) >= MASTERED else 1.0
+        learner.pace = FAST if env.penalty_scale == 1.0 and recent_success(points) >= NEARLY_ALWAYS else 1.0
         metrics = learner.iterate()
         # JSON has no NaN: undefined figures, such as the success rate of no episodes, are null.
         known = {name: None if math.isnan(value) else value for name, value in metrics.items()}
