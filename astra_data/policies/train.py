@@ -180,7 +180,7 @@ def train_in(
 
 
 def optimize(learner: Learner, env: TrainingEnv, training: Training, checkpoint: str = CHECKPOINT) -> dict[str, Any]:
-    """Train to the end, or on from the checkpoint; return the curve. A mastered simulator quickens what is left."""
+    """Train to the end, or on from the checkpoint; return the curve. What is left is quickened once little is to be learned."""
 
     def go_on(state: dict[str, Any]) -> None:
         world = {name: values.to(training.device) for name, values in state["world"].items()}
