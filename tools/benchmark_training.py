@@ -34,7 +34,7 @@ from astra_data.grounding.simulator import NO_GROUNDING, Grounding
 from astra_data.methods.iql import Experience, Iql, IqlConfig
 from astra_data.pipeline.recipe import Recipe
 from astra_data.policies import ppo as proximal
-from astra_data.policies.networks import ActorCritic, ActorCriticShape
+from astra_data.policies.networks import ActorCritic, PolicyShape
 from astra_data.policies.simulator_env import SimulatorEnv
 from astra_data.policies.train import PpoTrainConfig
 from astra_data.robots.ant.tasks import POSITIONS, VelocityController
@@ -126,7 +126,7 @@ def ppo_parts(grounding: Grounding, memory_size: int) -> tuple[SimulatorEnv, Act
     config = SETTINGS.train
     assert isinstance(config, PpoTrainConfig)
     env = SimulatorEnv(TASK.objective, grounding.simulator(TASK, config.num_envs))
-    shape = ActorCriticShape(
+    shape = PolicyShape(
         observation_size=env.observation_size,
         action_size=env.action_size,
         memory_size=memory_size,
@@ -157,7 +157,7 @@ def iql(quick: bool, stack: ExitStack) -> tuple[str, Candidates]:
     )
     values, policy = (
         Iql(
-            ActorCritic(ActorCriticShape(observation_size, action_size, hidden_sizes=(256, 256))),
+            ActorCritic(PolicyShape(observation_size, action_size, hidden_sizes=(256, 256))),
             experience,
             IqlConfig(
                 critic_updates=critic_updates,

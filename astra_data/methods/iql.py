@@ -242,7 +242,7 @@ def _position_features(task: Task) -> "PositionFeatures":
 
 def learn_from_episodes(training: Training) -> tuple[PolicyFile, dict[str, Any]]:
     """Learn by IQL from the target's side of the paired episodes; return the policy, and losses every few updates."""
-    from astra_data.policies.networks import ActorCritic, ActorCriticShape
+    from astra_data.policies.networks import ActorCritic, PolicyShape
 
     config, episodes = _config(training), training.episodes
     if config.temperature and not episodes.has_rewards:
@@ -250,7 +250,7 @@ def learn_from_episodes(training: Training) -> tuple[PolicyFile, dict[str, Any]]
     experience = experience_of(training.task, episodes)
     torch.manual_seed(derive(training.seed, "policy"))
     if training.initial is None:
-        shape = ActorCriticShape(
+        shape = PolicyShape(
             observation_size=experience.observation.shape[-1] - _position_features(training.task).size,
             action_size=experience.action.shape[-1],
             memory_size=training.config.memory_size,

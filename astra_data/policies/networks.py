@@ -17,6 +17,8 @@ from astra_data.grounding.encoder import HistoryEncoder, mlp
 from astra_data.policies.learner import PACKAGE_KINDS, ActingPolicy
 from astra_data.worlds.user_code import explained
 
+_INITIAL_LOG_STD = -0.5  # of the actions of an actor
+
 
 @dataclass(frozen=True)
 class PolicyShape:
@@ -89,13 +91,6 @@ class Policy(nn.Module, ABC):
         """Return the action (..., A), within ±1: the mode, or with `generator` a sample."""
 
 
-@dataclass(frozen=True)
-class ActorCriticShape(PolicyShape):
-    """Sizes of actor and critic, and their actions."""
-
-    initial_log_std: float = -0.5  # logarithm of the initial standard deviation
-
-
 def bounded(output: Tensor) -> Tensor:
     """Return `output` clipped to ±1, with its gradient: tanh is flat where policies push against walls."""
     return output + (output.clamp(-1.0, 1.0) - output).detach()
@@ -104,13 +99,11 @@ def bounded(output: Tensor) -> Tensor:
 class ActorCritic(Policy):
     """Bounded Gaussian mean with a state-independent deviation, and a value."""
 
-    shape: ActorCriticShape
-
-    def __init__(self, shape: ActorCriticShape) -> None:
+    def __init__(self, shape: PolicyShape) -> None:
         super().__init__(shape)
         self.actor = mlp((shape.feature_size, *shape.hidden_sizes, shape.action_size), inplace=True)
         self.critic = mlp((shape.feature_size, *shape.hidden_sizes, 1), inplace=True)
-        self.log_std = nn.Parameter(torch.full((shape.action_size,), shape.initial_log_std))
+        self.log_std = nn.Parameter(torch.full((shape.action_size,), _INITIAL_LOG_STD))
         for network, gain in ((self.actor, 0.01), (self.critic, 1.0)):
             layers = [layer for layer in network if isinstance(layer, nn.Linear)]
             for layer in layers:
@@ -174,7 +167,7 @@ class SoftActor(Policy):
 
 
 @dataclass(frozen=True)
-class AdaptiveShape(ActorCriticShape):
+class AdaptiveShape(PolicyShape):
     """Sizes of teacher and student."""
 
     extrinsics_size: int = 8  # E
@@ -347,6 +340,6 @@ class UserPolicy(Policy):
         return torch.from_numpy(action).clamp(-1.0, 1.0)
 
 
-_MADE = ((ActorCritic, ActorCriticShape), (Student, AdaptiveShape), (SoftActor, PolicyShape))
+_MADE = ((ActorCritic, PolicyShape), (Student, AdaptiveShape), (SoftActor, PolicyShape))
 NETWORKS: dict[str, tuple[type[Policy], type[PolicyShape]]] = dict(zip(PACKAGE_KINDS, _MADE, strict=True))
 """The policies of the package, with their shapes, by what their files call them."""

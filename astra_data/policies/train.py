@@ -3,7 +3,7 @@
 import math
 import shutil
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -165,7 +165,7 @@ def train_in(
     env: TrainingEnv, config: PpoTrainConfig | SacTrainConfig, memory_size: int, training: Training, horizon: int
 ) -> tuple["Policy", dict[str, Any]]:
     """Train a new policy in `env`, of episodes of at most `horizon` steps; return it and its learning curve."""
-    from astra_data.policies.networks import ActorCritic, ActorCriticShape, PolicyShape, SoftActor
+    from astra_data.policies.networks import ActorCritic, PolicyShape, SoftActor
 
     torch.manual_seed(derive(training.seed, "policy"))
     shape = PolicyShape(env.observation_size, env.action_size, memory_size, hidden_sizes=config.hidden_sizes)
@@ -174,13 +174,13 @@ def train_in(
     if isinstance(config, SacTrainConfig):
         learner = Sac(env, SoftActor(shape).to(training.device), config, **options)
     else:
-        policy = ActorCritic(ActorCriticShape(**asdict(shape))).to(training.device)
+        policy = ActorCritic(shape).to(training.device)
         learner = Ppo(env, policy, config, **options)
     return learner.policy, optimize(learner, env, training)
 
 
 def optimize(learner: Learner, env: TrainingEnv, training: Training, checkpoint: str = CHECKPOINT) -> dict[str, Any]:
-    """Train to the end, or on from the checkpoint; return the curve. What is left is quickened once little is to be learned."""
+    """Train to the end, or on from the checkpoint; return the curve. Success quickens what is left."""
 
     def go_on(state: dict[str, Any]) -> None:
         world = {name: values.to(training.device) for name, values in state["world"].items()}

@@ -25,7 +25,7 @@ from astra_data.pipeline.stages.ground import ground
 from astra_data.pipeline.stages.pair import PairConfig, pair
 from astra_data.pipeline.stages.train import train
 from astra_data.pipeline.trained_policy import load_policy
-from astra_data.policies.networks import ActorCritic, ActorCriticShape, PolicyShape, SoftActor
+from astra_data.policies.networks import ActorCritic, PolicyShape, SoftActor
 from astra_data.policies.running_policy import PolicyFile, RunningPolicy
 from astra_data.robots.registry import TASKS
 
@@ -144,7 +144,7 @@ def test_the_policy_is_that_of_the_seed_and_size_that_are_asked_for(tmp_path: Pa
     for where in ("050/seed_0", "050/seed_1", "100/seed_1"):
         out = run / f"train/direct_transfer/percent_{where}"
         out.mkdir(parents=True)
-        policy = ActorCritic(ActorCriticShape(2, 1, hidden_sizes=(8,), memory_size=4))
+        policy = ActorCritic(PolicyShape(2, 1, hidden_sizes=(8,), memory_size=4))
         PolicyFile(policy, None, f"drives {where}", "0" * 64).save(out / "policy.safetensors")
     (run / "recipe.json").write_text(json.dumps({"task": f"{code}:TASK", "sweep": {"percent": [50, 100]}}))
     folder = deploy(run, "direct_transfer", tmp_path / "policy", seed=1, percent=50)
@@ -179,7 +179,7 @@ def test_a_description_names_encoder_limit_and_frames() -> None:
     task = TASKS["antmaze-umaze"]
     latent = GroundingModel(GroundingShape(4, 2, 2, latent_size=8))
     aligned = TargetEncoder(29, 2, 2, embedding_size=8, latent_size=8)
-    policy = ActorCritic(ActorCriticShape(16, 2))
+    policy = ActorCritic(PolicyShape(16, 2))
     about = describe(RunningPolicy(task, policy, latent, aligned, command_limit=0.4), {"memory": 2})
     assert (about["encoder"], about["command_limit"]) == ("target", 0.4)
     whole = SoftActor(PolicyShape(33, 2, hidden_sizes=(8,)))

@@ -14,7 +14,7 @@ from astra_data.core.errors import BadInputError
 from astra_data.deployment.graph import ONNX, PolicyGraph, _apart, load_onnx, write_graph
 from astra_data.grounding.alignment import TargetEncoder
 from astra_data.grounding.model import GroundingModel, GroundingShape
-from astra_data.policies.networks import ActorCritic, ActorCriticShape, AdaptiveShape, PolicyShape, SoftActor, Student
+from astra_data.policies.networks import ActorCritic, AdaptiveShape, PolicyShape, SoftActor, Student
 from astra_data.policies.running_policy import RunningPolicy
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.task import Task
@@ -45,7 +45,7 @@ def lively[P: ActorCritic](policy: P) -> P:
 
 
 def actor(observation_size: int, action_size: int = 2, **sizes: Any) -> ActorCritic:
-    return lively(ActorCritic(ActorCriticShape(observation_size, action_size, hidden_sizes=(8,), **sizes)))
+    return lively(ActorCritic(PolicyShape(observation_size, action_size, hidden_sizes=(8,), **sizes)))
 
 
 def policies() -> dict[str, RunningPolicy]:

@@ -13,7 +13,7 @@ from astra_data.core.artifact import write_manifest
 from astra_data.deployment.folder import describe
 from astra_data.deployment.graph import write_graph
 from astra_data.deployment.run_policy import RobotPolicy, refuse_far, run
-from astra_data.policies.networks import ActorCritic, ActorCriticShape
+from astra_data.policies.networks import ActorCritic, PolicyShape
 from astra_data.policies.running_policy import RunningPolicy
 
 
@@ -21,7 +21,7 @@ from astra_data.policies.running_policy import RunningPolicy
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = tmp_path_factory.mktemp("cart")
     torch.manual_seed(0)
-    deployed = RunningPolicy(TASK, ActorCritic(ActorCriticShape(2, 1, memory_size=4)))
+    deployed = RunningPolicy(TASK, ActorCritic(PolicyShape(2, 1, memory_size=4)))
     parts, _ = write_graph(deployed, made)
     recorded = ([-0.5, 0.0], [1.0, 2.0])
     (made / "policy.json").write_text(json.dumps(describe(deployed, parts, recorded)))

@@ -13,7 +13,7 @@ from astra_data.grounding.files import load_grounding, load_target_encoder, save
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.model import GroundingModel, GroundingShape
 from astra_data.methods import add_method
-from astra_data.policies.networks import ActorCritic, ActorCriticShape
+from astra_data.policies.networks import ActorCritic, PolicyShape
 from astra_data.policies.running_policy import RunningPolicy
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.user_code import user_object
@@ -62,7 +62,7 @@ def test_another_encoder_grounds_aligns_and_acts(tmp_path: Path) -> None:
     torch.testing.assert_close(simulator.latent, model.encoder.sequence(history)[0][:, -1])
     encoder = TargetEncoder(29, 2, 2, embedding_size=8, latent_size=8, encoder="transformer")
     save_target_encoder(tmp_path / "encoder", encoder)
-    policy = ActorCritic(ActorCriticShape(8 + 8, 2))
+    policy = ActorCritic(PolicyShape(8 + 8, 2))
     running = RunningPolicy(TASKS["antmaze-umaze"], policy, model, load_target_encoder(tmp_path / "encoder"))
     running.start(2)
     first, second = (running.act(torch.ones(2, 29), goal) for _ in range(2))

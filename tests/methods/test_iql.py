@@ -14,7 +14,7 @@ from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.simulator import NO_GROUNDING
 from astra_data.methods import METHODS, iql
 from astra_data.methods.iql import Iql, IqlConfig, clone_behavior, experience_of, learn_from_episodes
-from astra_data.policies.networks import ActorCritic, ActorCriticShape
+from astra_data.policies.networks import ActorCritic, PolicyShape
 from astra_data.policies.running_policy import PolicyFile
 from astra_data.policies.train import PpoTrainConfig, Training
 from astra_data.robots.registry import TASKS
@@ -52,7 +52,7 @@ def episodes() -> PairedEpisodes:
 @pytest.fixture
 def given() -> PolicyFile:
     torch.manual_seed(5)
-    policy = ActorCritic(ActorCriticShape(observation_size=8, action_size=2, memory_size=8))
+    policy = ActorCritic(PolicyShape(observation_size=8, action_size=2, memory_size=8))
     return PolicyFile(policy.requires_grad_(False), None, "toy@data-1.0.0", "abc")
 
 

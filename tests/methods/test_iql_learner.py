@@ -12,7 +12,7 @@ from astra_data.core.seeding import derive
 from astra_data.grounding.paired_episodes import draw_steps
 from astra_data.methods import iql as module
 from astra_data.methods.iql import Experience, Iql, IqlConfig, transitions
-from astra_data.policies.networks import ActorCritic, ActorCriticShape, Policy
+from astra_data.policies.networks import ActorCritic, Policy, PolicyShape
 
 QUICK = IqlConfig(
     critic_updates=300,
@@ -68,7 +68,7 @@ def walks(count: int = 64, steps: int = 24) -> Experience:
 
 def learner(experience: Experience, settings: IqlConfig, memory: int = 0) -> Iql:
     torch.manual_seed(1)
-    return Iql(ActorCritic(ActorCriticShape(1, 1, memory, 8, (32,))), experience, settings, seed=2)
+    return Iql(ActorCritic(PolicyShape(1, 1, memory, 8, (32,))), experience, settings, seed=2)
 
 
 def trained(iql: Iql) -> Iql:

@@ -17,7 +17,7 @@ from astra_data.grounding.model import GroundingModel, GroundingShape, LossWeigh
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.pipeline.stages import align
 from astra_data.pipeline.stages.collect import CollectConfig
-from astra_data.policies.networks import ActorCritic, ActorCriticShape
+from astra_data.policies.networks import ActorCritic, PolicyShape
 from astra_data.policies.ppo import Ppo, PpoConfig
 from astra_data.policies.simulator_env import Simulation, WorldConfig, data_starts, training_env
 from astra_data.robots.registry import task_named
@@ -112,7 +112,7 @@ def test_the_first_update_of_ppo_is_that_of_the_package(both: tuple[Any, ...]) -
     starts = data_starts(task, simulation.world, episodes, grounding)
     env = training_env(task, simulation, grounding, num_envs=32, device="cpu", starts=starts)
     torch.manual_seed(2)
-    policy = ActorCritic(ActorCriticShape(env.observation_size, 1))
+    policy = ActorCritic(PolicyShape(env.observation_size, 1))
     torch.manual_seed(2)
     my_policy = of_the_file("ActorCritic")(env.observation_size, 1)
     before = [values.clone() for values in my_policy.state_dict().values()]

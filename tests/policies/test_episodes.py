@@ -27,7 +27,7 @@ from astra_data.policies.episodes import (
     reached_in_own_world,
     started,
 )
-from astra_data.policies.networks import ActorCritic, ActorCriticShape, UserPolicy
+from astra_data.policies.networks import ActorCritic, PolicyShape, UserPolicy
 from astra_data.policies.running_policy import Observed, PolicyFile, RunningPolicy, running
 from astra_data.policies.simulator_env import Simulation, SimulatorEnv, WorldConfig, training_env
 from astra_data.robots.registry import TASKS
@@ -297,7 +297,7 @@ def test_a_deployed_policy_sees_what_it_saw_in_training() -> None:
     torch.manual_seed(0)
     env = world("full")
     observation = env.reset()
-    policy = ActorCritic(ActorCriticShape(33, 2))
+    policy = ActorCritic(PolicyShape(33, 2))
     deployed = RunningPolicy(TASK, policy, observed="full")
     assert deployed.observation_size == 33
     deployed.start(4)

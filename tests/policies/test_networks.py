@@ -12,7 +12,7 @@ OBSERVATION, ACTION = torch.randn(3, 5, 4), torch.randn(3, 5, 2)
 def policies(memory_size: int) -> list[networks.Policy]:
     torch.manual_seed(0)
     sizes = {"observation_size": 4, "action_size": 2, "memory_size": memory_size, "embedding_size": 7}
-    return [networks.ActorCritic(networks.ActorCriticShape(**sizes)), networks.SoftActor(networks.PolicyShape(**sizes))]  # type: ignore[arg-type]
+    return [networks.ActorCritic(networks.PolicyShape(**sizes)), networks.SoftActor(networks.PolicyShape(**sizes))]  # type: ignore[arg-type]
 
 
 def steps(policy: networks.Policy, hidden: Tensor) -> Tensor:
@@ -49,10 +49,10 @@ def test_means_are_clipped_and_keep_the_gradient_of_what_is_not() -> None:
     torch.testing.assert_close(mean, torch.tensor([-1.0, -0.4, 0.9, 1.0]))
     mean.sum().backward()
     assert output.grad is not None and torch.equal(output.grad, torch.ones(4))
-    policy, seen = networks.ActorCritic(networks.ActorCriticShape(3, 2, initial_log_std=-1.0)), 1e3 * torch.randn(50, 3)
+    policy, seen = networks.ActorCritic(networks.PolicyShape(3, 2)), 1e3 * torch.randn(50, 3)
     clipped, std = policy.policy(seen)
     torch.testing.assert_close(clipped, policy.actor(seen).clamp(-1.0, 1.0))
-    torch.testing.assert_close(std, torch.full((50, 2), -1.0).exp())
+    torch.testing.assert_close(std, torch.full((50, 2), -0.5).exp())
     assert policy.value(seen).shape == (50,)
 
 
@@ -108,7 +108,7 @@ def test_features_are_those_of_an_actor_critic_and_the_extrinsics() -> None:
     teacher, observed = networks.Teacher(SHAPE, parameter_count=6), torch.randn(5, 9, 3 + 6)
     student, plain = (
         networks.Student.of_teacher(teacher),
-        networks.ActorCritic(networks.ActorCriticShape(3, 2, memory_size=8)),
+        networks.ActorCritic(networks.PolicyShape(3, 2, memory_size=8)),
     )
     assert plain.memory is not None and teacher.memory is not None
     plain.memory.load_state_dict(teacher.memory.state_dict())

@@ -13,7 +13,7 @@ from toy_worlds import ConstantReward, EndsAtZero, GoToZero, Recall, assert_resu
 
 from astra_data.core.errors import BadInputError
 from astra_data.policies import ppo as module
-from astra_data.policies.networks import ActorCritic, ActorCriticShape
+from astra_data.policies.networks import ActorCritic, PolicyShape
 from astra_data.policies.ppo import Ppo, PpoConfig, ReturnScale, generalized_advantages
 from astra_data.worlds.protocols import BatchedEnv
 
@@ -28,7 +28,7 @@ def ppo(env: BatchedEnv, iterations: int, *, horizon: int, memory: int = 0, **se
         total_steps=iterations * env.num_envs * 16, **{"rollout_steps": 16, "learning_rate": 3e-3, **settings}
     )
     torch.manual_seed(0)
-    shape = ActorCriticShape(env.observation_size, env.action_size, memory, 16, (32,))
+    shape = PolicyShape(env.observation_size, env.action_size, memory, 16, (32,))
     return Ppo(env, ActorCritic(shape), config, horizon=horizon, seed=1)
 
 

@@ -16,7 +16,7 @@ from astra_data.grounding.files import save_grounding
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.model import GroundingModel, GroundingShape
 from astra_data.policies.learner import KINDS
-from astra_data.policies.networks import ActorCritic, ActorCriticShape, AdaptiveShape, Student, UserPolicy
+from astra_data.policies.networks import ActorCritic, AdaptiveShape, PolicyShape, Student, UserPolicy
 from astra_data.policies.running_policy import Array, PolicyFile, RunningPolicy, Shown
 from astra_data.policies.simulator_env import Simulation, WorldConfig, policy_observation
 from astra_data.robots.registry import TASKS
@@ -46,7 +46,7 @@ def test_latents_are_those_of_the_whole_history(aligned: bool, in_simulator: boo
     torch.manual_seed(0)
     model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8))
     target = TargetEncoder(29, 2, 2, embedding_size=8, latent_size=8)
-    policy = ActorCritic(ActorCriticShape(observation_size=16, action_size=2))
+    policy = ActorCritic(PolicyShape(observation_size=16, action_size=2))
     for layer in policy.actor.parameters():
         layer.mul_(10)  # actions of some size
     running = RunningPolicy(TASK, policy, model, target if aligned else None)
@@ -77,7 +77,7 @@ def sensing(**pictures: Any) -> TargetEncoder:
 def test_with_inputs_the_policy_observes_an_estimate_in_place_of_phi(aligned: bool) -> None:
     torch.manual_seed(0)
     model, eyes = GroundingModel(GroundingShape(4, 2, 2, latent_size=8)), sensing()
-    policy = ActorCritic(ActorCriticShape(observation_size=16, action_size=2))
+    policy = ActorCritic(PolicyShape(observation_size=16, action_size=2))
     for layer in policy.actor.parameters():
         layer.mul_(10)
     running = RunningPolicy(TASK, policy, model, eyes if aligned else None, sensing=eyes)
@@ -106,7 +106,7 @@ def test_in_place_of_features_come_pictures_of_their_camera(tmp_path: Path) -> N
     )
     origin = {"camera": camera, "encoder": f"{code}:Eyes", "file_sha256": file_digest(code)}
     eyes = sensing(**{"observation.features.front": origin})
-    policy = ActorCritic(ActorCriticShape(observation_size=8, action_size=2))
+    policy = ActorCritic(PolicyShape(observation_size=8, action_size=2))
     running = RunningPolicy(TASK, policy, sensing=eyes)
     pictures = np.random.default_rng(0).integers(0, 255, (3, 4, 4, 3)).astype(np.uint8)
     features, joints = pictures[:, 0, 0].astype(np.float32), STATE[:, 0, 3:]
@@ -136,7 +136,7 @@ def test_in_place_of_features_come_pictures_of_their_camera(tmp_path: Path) -> N
 
 
 def test_states_and_inputs_are_not_taken_for_each_other() -> None:
-    policy = ActorCritic(ActorCriticShape(observation_size=8, action_size=2))
+    policy = ActorCritic(PolicyShape(observation_size=8, action_size=2))
     running = RunningPolicy(TASK, policy)
     running.start(1)
     with pytest.raises(BadInputError, match="expected states, got a dict"):
@@ -152,7 +152,7 @@ def test_states_and_inputs_are_not_taken_for_each_other() -> None:
 @torch.no_grad()
 def test_a_policy_of_the_raw_simulator_remembers_and_forgets_at_the_start() -> None:
     torch.manual_seed(0)
-    policy = ActorCritic(ActorCriticShape(observation_size=8, action_size=2, memory_size=8))
+    policy = ActorCritic(PolicyShape(observation_size=8, action_size=2, memory_size=8))
     running = RunningPolicy(TASK, policy)
     actions = run(running)
     observation = policy_observation(TASK.objective, STATE[..., [0, 1, 15, 16]], GOALS, None)
@@ -173,7 +173,7 @@ def test_a_policy_of_the_raw_simulator_remembers_and_forgets_at_the_start() -> N
 def test_the_encoder_sees_the_shortened_command_and_the_policy_its_own() -> None:
     torch.manual_seed(0)
     model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8))
-    policy = ActorCritic(ActorCriticShape(observation_size=16, action_size=2, memory_size=8))
+    policy = ActorCritic(PolicyShape(observation_size=16, action_size=2, memory_size=8))
     for layer in policy.actor.parameters():
         layer.mul_(20)  # actions of some size
     running = RunningPolicy(TASK, policy, model, command_limit=0.2)
@@ -194,7 +194,7 @@ def test_the_encoder_sees_the_shortened_command_and_the_policy_its_own() -> None
 
 
 def test_states_and_goals_come_as_arrays_too_and_are_looked_at_first() -> None:
-    running = RunningPolicy(RAIL_CART, ActorCritic(ActorCriticShape(observation_size=2, action_size=1)))
+    running = RunningPolicy(RAIL_CART, ActorCritic(PolicyShape(observation_size=2, action_size=1)))
     state, goal = np.random.default_rng(0).uniform(size=(4, 2)), np.zeros((4, 1))
     with pytest.raises(BadInputError, match=r"expected start\(count\) before the first command"):
         running.command(state, goal)
@@ -251,7 +251,7 @@ def test_what_is_no_policy_is_answered_by_a_line(act: Any, message: str) -> None
 
 
 def test_a_policy_comes_back_frozen_with_its_world(tmp_path: Path) -> None:
-    policy = ActorCritic(ActorCriticShape(3, 2, memory_size=8, hidden_sizes=(16, 8)))
+    policy = ActorCritic(PolicyShape(3, 2, memory_size=8, hidden_sizes=(16, 8)))
     world = WorldConfig(reward="priced", change_penalty=0.02, command_limit=0.7, data_start_share=0.5)
     variation = PlanarVariation(friction=(0.8, 1.2))
     simulation = Simulation(world, variation)
@@ -295,7 +295,7 @@ def test_networks_that_could_not_be_read_again_are_not_written(tmp_path: Path) -
     class Mine(ActorCritic):
         pass
 
-    made = PolicyFile(Mine(ActorCriticShape(3, 2)), None, None, None)
+    made = PolicyFile(Mine(PolicyShape(3, 2)), None, None, None)
     with pytest.raises(BadInputError, match=r"^a Mine cannot be read again: expected a .*SoftActor, or what"):
         made.save(tmp_path / "policy.safetensors")
     assert not [*tmp_path.iterdir()]

@@ -17,7 +17,7 @@ from astra_data.grounding.model import GroundingModel, GroundingShape
 from astra_data.grounding.simulator import NO_GROUNDING, Grounding
 from astra_data.policies import train
 from astra_data.policies.episodes import Reached
-from astra_data.policies.networks import ActorCritic, ActorCriticShape
+from astra_data.policies.networks import ActorCritic, PolicyShape
 from astra_data.policies.ppo import Ppo
 from astra_data.policies.running_policy import PolicyFile
 from astra_data.policies.simulator_env import RewardSource, Simulation, WorldConfig
@@ -199,7 +199,7 @@ def test_each_try_has_its_part_of_the_progress_and_a_policy_says_what_it_learned
 
     def learn(one: train.Training) -> tuple[PolicyFile, dict[str, Any]]:
         one.progress(0.5, "half")
-        return one.learned(ActorCritic(ActorCriticShape(8, 2)), Simulation(WorldConfig())), {"points": []}
+        return one.learned(ActorCritic(PolicyShape(8, 2)), Simulation(WorldConfig())), {"points": []}
 
     monkeypatch.setattr("astra_data.policies.train.reached_in_own_world", lambda *_: Reached(0.0, 1.0))
     learned, _ = train.with_restarts(learn, given, None)

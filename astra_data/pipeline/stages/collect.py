@@ -202,11 +202,11 @@ def suboptimal_by_ppo(
     task: Task, *, steps: int, seed: int, folder: Path, num_threads: int | None, progress: Progress
 ) -> tuple[PolicyFile, Metadata]:
     """Train a policy without memory on φ of the target's state, for `steps`; resume from a checkpoint in `folder`."""
-    from astra_data.policies.networks import ActorCritic, ActorCriticShape
+    from astra_data.policies.networks import ActorCritic, PolicyShape
 
     torch.manual_seed(derive(seed, "suboptimal policy"))
     world = ObservedTargetEnv(task, _PPO_ENVS, num_threads=num_threads)
-    policy = ActorCritic(ActorCriticShape(world.observation_size, world.action_size))
+    policy = ActorCritic(PolicyShape(world.observation_size, world.action_size))
     ppo = Ppo(world, policy, PpoConfig(total_steps=steps), horizon=task.objective.horizon, seed=seed)
     judge: Judge = lambda figures: (ppo.steps / steps, f"reward per step {figures['reward']:.3f}")  # noqa: E731
     return _trained(ppo, world, judge, folder, progress, "abstract")

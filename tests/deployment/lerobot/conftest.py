@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from astra_data.deployment.folder import deploy
-from astra_data.policies.networks import ActorCritic, ActorCriticShape
+from astra_data.policies.networks import ActorCritic, PolicyShape
 from astra_data.policies.running_policy import PolicyFile
 
 TASK = f"{Path(__file__).parents[2] / 'small_cart.py'}:TASK"
@@ -18,7 +18,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = run / "train/direct_transfer/seed_0"
     folder.mkdir(parents=True)
     torch.manual_seed(0)
-    policy = ActorCritic(ActorCriticShape(2, 1, hidden_sizes=(8,), memory_size=4))
+    policy = ActorCritic(PolicyShape(2, 1, hidden_sizes=(8,), memory_size=4))
     with torch.no_grad():
         for weight in policy.actor[-1].parameters():
             weight.mul_(50)

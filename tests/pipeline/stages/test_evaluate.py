@@ -23,7 +23,7 @@ from astra_data.grounding.model import GroundingModel
 from astra_data.methods.rma import RmaConfig
 from astra_data.pipeline.stages.evaluate import EvaluateConfig, evaluate
 from astra_data.pipeline.stages.train import train
-from astra_data.policies.networks import ActorCritic, ActorCriticShape
+from astra_data.policies.networks import ActorCritic, PolicyShape
 from astra_data.policies.running_policy import PolicyFile
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.plane.navigation import Navigation
@@ -180,7 +180,7 @@ def test_a_policy_that_was_in_no_simulator_is_tested_in_the_target_alone(
     task: str, trained: Path, tmp_path: Path
 ) -> None:
     grounded_policy = PolicyFile.load(trained / "policy.safetensors")
-    policy = ActorCritic(ActorCriticShape(observation_size=8, action_size=2, memory_size=4))
+    policy = ActorCritic(PolicyShape(observation_size=8, action_size=2, memory_size=4))
     replace(grounded_policy, policy=policy, simulation=None).save(tmp_path / "policy.safetensors")
     told, paths = make(task, "iql", tmp_path / "out", {"policy": tmp_path})
     assert "simulated" not in told and "simulated.position" not in paths and told["encoders"].keys() == {"source"}

@@ -15,7 +15,7 @@ from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.methods import METHODS
 from astra_data.methods.rma import RmaConfig
 from astra_data.pipeline.stages.train import train
-from astra_data.policies.networks import ActorCritic, ActorCriticShape, SoftActor, Student
+from astra_data.policies.networks import ActorCritic, PolicyShape, SoftActor, Student
 from astra_data.policies.running_policy import PolicyFile
 from astra_data.policies.simulator_env import Simulation, WorldConfig, command_limit, plus
 from astra_data.policies.train import PpoTrainConfig, SacTrainConfig, Training
@@ -201,7 +201,7 @@ def test_trainings_without_a_simulator_are_made_once(
     task: str, paired: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Whatever they learned, there is no simulator of theirs to test it in."""
-    policy = PolicyFile(ActorCritic(ActorCriticShape(6, 2)), None, "toy@data-1.0.0", "abc")
+    policy = PolicyFile(ActorCritic(PolicyShape(6, 2)), None, "toy@data-1.0.0", "abc")
     given = list[Training]()
 
     def learn(training: Training) -> tuple[PolicyFile, dict[str, Any]]:
@@ -218,10 +218,10 @@ def test_trainings_without_a_simulator_are_made_once(
 @pytest.mark.parametrize(
     ("returned", "told"),
     [
-        (ActorCritic(ActorCriticShape(6, 2)), "ActorCritic"),
-        ((ActorCritic(ActorCriticShape(6, 2)), {"points": []}), "ActorCritic and dict"),
+        (ActorCritic(PolicyShape(6, 2)), "ActorCritic"),
+        ((ActorCritic(PolicyShape(6, 2)), {"points": []}), "ActorCritic and dict"),
         ((), "nothing"),
-        ((PolicyFile(ActorCritic(ActorCriticShape(6, 2)), None, None, None), []), "PolicyFile and list"),
+        ((PolicyFile(ActorCritic(PolicyShape(6, 2)), None, None, None), []), "PolicyFile and list"),
     ],
 )
 def test_what_a_function_of_the_user_s_learns_is_a_policy_file_and_a_curve(
