@@ -131,7 +131,10 @@ def validated[M: BaseModel](tables: Mapping[str, Any], model: type[M], origin: s
     except RecursionError:
         raise RecipeError(f"{origin} is nested too deeply") from None
     except ValidationError as error:
-        faults = [_fault(details, model) for details in error.errors(include_url=False)]
+        found = error.errors(include_url=False)
+        # Of a list with a wrong entry the right ones alone are counted.
+        within = {one["loc"][:depth] for one in found for depth in range(len(one["loc"]))}
+        faults = [_fault(one, model) for one in found if one["type"] != "too_short" or one["loc"] not in within]
     if len(faults) == 1:
         raise RecipeError(f"{origin}: {faults[0]}")
     raise RecipeError("\n  ".join([f"{origin} has {len(faults)} errors:", *faults]))

@@ -124,7 +124,7 @@ class Dataset:
         """
         rows, row = int(self.lengths[self.selected(episodes)].sum()), 0
         out = {c.name: np.empty((rows, c.size) if c.size > 1 else rows, c.dtype) for c in self.specs(names)}
-        for block in self.blocks(names, episodes):
+        for block in self.blocks([*out], episodes):
             end = row + len(next(iter(block.values())))
             for name, values in block.items():
                 out[name][row:end] = values
@@ -287,7 +287,8 @@ class Dataset:
         """Return the columns `names`."""
         if isinstance(names, str):
             raise BadInputError(f"expected a list of columns, got the text '{names}': write ['{names}']")
-        if unknown := ", ".join(name for name in names if name not in self.features):
+        names = [*names]  # which may come one by one
+        if unknown := ", ".join(f"{name}" for name in names if name not in self.features):
             raise BadInputError(f"{self.reference} has no column {unknown}; it has {', '.join(self.features)}.")
         return [Column.from_feature(name, self.features[name]) for name in names]
 

@@ -170,11 +170,11 @@ class Rounding:
         self._low = np.minimum(self._low, exact.min(axis=0, initial=np.inf))
         self._high = np.maximum(self._high, exact.max(axis=0, initial=-np.inf))
         rows = np.arange(0, len(exact) - 1, max(1, len(exact) // _SAMPLES))
-        # Between integers first: those of uint64 may be equal as float64.
-        steps = np.where(values[rows + 1] == values[rows], 0.0, exact[rows + 1] - exact[rows])
+        whole = values.astype(np.int64) if values.dtype.kind in "iu" else exact  # larger integers are no float64
+        steps = np.asarray(whole[rows + 1] - whole[rows], np.float64)
         errors = held[rows + 1].astype(np.float64) - held[rows] - steps
-        # Less is the noise of a computation with float64.
-        steps[np.abs(steps) < 64 * np.spacing(np.abs(exact[rows]))] = 0.0
+        # Less is the noise of a computation with float64, if it is no count.
+        steps[(np.abs(steps) < 64 * np.spacing(np.abs(exact[rows]))) & (steps % 1 != 0)] = 0.0
         self._samples.append(np.abs([steps, errors]))
         if sum(part.shape[1] for part in self._samples) > _MOST_SAMPLES:
             self._samples = [np.concatenate(self._samples, axis=1)[:, ::2]]
@@ -198,7 +198,7 @@ class Rounding:
             spacing = float(np.spacing(np.float32(largest)))
             is_count = spacing <= 2 and step == round(step)
             lost |= share >= _LOST and largest > _LARGE and not is_count
-            digit = 10.0 ** np.floor(np.log10(high - low))
+            digit = 10.0 ** np.floor(np.log10(max(high - low, step)))
             offset[entry] = round(offset[entry] - digit * round((low + high) / 2 / digit), 12)
             helps &= float(np.spacing(np.float32(high - low))) / 3 < _ROUNDED * step
             name = self._column.names[entry] if self._column.names else f"entry {entry}"

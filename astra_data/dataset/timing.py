@@ -91,7 +91,9 @@ def resample(source: Dataset, fps: int, *, name: str | None = None, out: Path | 
             f"divides {source.info['fps']}, got {fps}"
         )
     schema = [column for column in source.schema if not column.name.startswith("abstract.")]
-    slower = (slow for episode in source.episodes() if (slow := _resampled(episode, schema, source.info["fps"], fps)))
+    found = source.statistics()
+    turns = [(column, _turns(column, found[column.name])) for column in schema]
+    slower = (slow for episode in source.episodes() if (slow := _resampled(episode, turns, source.info["fps"], fps)))
     config = {"fps": fps, "from_fps": source.info["fps"]}
     made = _write(source, "columns", schema, slower, fps, stage="resample", config=config, name=name, out=out)
     if paired := [column.name for column in source.schema if column not in schema]:
@@ -138,6 +140,8 @@ def _condition(source: Dataset, text: str) -> Callable[[Episode], Bools]:
     if value not in known:
         raise BadInputError(f"{source.reference} has no value {value!r}{did_you_mean(value, known)}")
     column, index = known[value]
+    if column.dtype == "bool" and limit not in (0.0, 1.0):
+        raise BadInputError(f"{value} is true or false: expected one of them, got {number}")
     compare = _COMPARED[compared]
     return lambda episode: compare(as_rows(episode.columns[column.name])[:, index].astype(np.float64), limit)
 
@@ -167,7 +171,9 @@ def _facts(columns: Mapping[str, Array], metadata: Mapping[str, Any]) -> dict[st
     return {**metadata, **{key: value for key, value in outcome_of(columns).items() if key in metadata}}
 
 
-def _resampled(episode: Episode, schema: Sequence[Column], before: int, fps: int) -> Episode | None:
+def _resampled(
+    episode: Episode, turns: Sequence[tuple[Column, dict[int, float]]], before: int, fps: int
+) -> Episode | None:
     has_next = names.NEXT_STATE in episode.columns
     duration_s = (len(episode) - (not has_next)) / before
     steps = int(duration_s * fps + 1e-6) + (not has_next)
@@ -176,7 +182,7 @@ def _resampled(episode: Episode, schema: Sequence[Column], before: int, fps: int
     times_s = np.arange(steps + 1) / fps
     row = np.minimum((times_s * before + 1e-6).astype(int), len(episode))
     columns: dict[str, Array] = {}
-    for column in schema:
+    for column, angles in turns:
         values = episode.columns[column.name]
         if column.name == names.REWARD:
             sums = np.concatenate([[0.0], np.cumsum(values, dtype=np.float64)])
@@ -190,8 +196,11 @@ def _resampled(episode: Episode, schema: Sequence[Column], before: int, fps: int
             of = episode.columns[names.STATE] if column.name == names.NEXT_STATE else values
             if has_next and column.name in (names.STATE, names.NEXT_STATE):
                 of = np.concatenate([of, episode.columns[names.NEXT_STATE][-1:]])
+            elif is_clock(column):
+                of = np.concatenate([of, 2 * of[-1:] - of[-2:-1]]) if len(of) > 1 else of
             at = times_s[1:] if column.name == names.NEXT_STATE else times_s[:-1]
-            found = _interpolated(as_rows(of).astype(np.float64), at * before, column).reshape(steps, *values.shape[1:])
+            found = _interpolated(as_rows(of).astype(np.float64), at * before, column, angles)
+            found = found.reshape(steps, *values.shape[1:])
         else:
             found = values[np.minimum(row[:-1], len(episode) - 1)]
         columns[column.name] = found.astype(values.dtype)
@@ -199,11 +208,17 @@ def _resampled(episode: Episode, schema: Sequence[Column], before: int, fps: int
     return replace(episode, columns=columns, metadata=_facts(columns, episode.metadata), cameras=cameras)
 
 
-def _interpolated(values: Floats, at: Floats, column: Column) -> Floats:
-    """Return rows of `values` (N, D) `at` places between 0 and N - 1, (M, D)."""
+def _turns(column: Column, found: Mapping[str, Array]) -> dict[int, float]:
+    """Return the full turns of the angles in a column by index; those that range over more are counted, and go on."""
+    ranges = np.ravel(found["max"]) - np.ravel(found["min"])
+    units = zip(column.units, ranges, strict=False)
+    return {n: TURNS[unit] for n, (unit, wide) in enumerate(units) if unit in TURNS and wide <= 1.001 * TURNS[unit]}
+
+
+def _interpolated(values: Floats, at: Floats, column: Column, turns: Mapping[int, float]) -> Floats:
+    """Return rows of `values` (N, D) `at` places between 0 and N - 1, (M, D); `turns` are those of wrapped angles."""
     recorded = values
     values = values.copy()
-    turns = {index: TURNS[unit] for index, unit in enumerate(column.units) if unit in TURNS}
     for index, turn in turns.items():
         values[:, index] = np.unwrap(values[:, index], period=turn)
     low = np.minimum(at.astype(int), len(values) - 1)

@@ -21,7 +21,7 @@ class RobotPolicy:
         """Take the rate at which it will act, and the names of the values that it will be given."""
         described, graph = intact(folder, "policy.json", "policy.onnx")
         self.about: dict[str, Any] = json.loads(described)
-        if abs(rate_hz / self.about["rate_hz"] - 1.0) > 0.01:
+        if not abs(rate_hz / self.about["rate_hz"] - 1.0) <= 0.01:  # nor NaN
             raise ValueError(f"rate_hz: expected {self.about['rate_hz']:g}, got {rate_hz:g}")
         for column, names in (("state", state), ("goal", goal)):
             if list(names) != (expected := self.about[column]["names"]):

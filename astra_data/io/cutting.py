@@ -266,14 +266,14 @@ class Cutter:
         tally, fps, time = self.tally, self._mapping.fps, self._mapping.time
         tally.notes += self.rounded()
         timed = [(part.origin, spent) for part, spent in zip(self._parts, self._spent, strict=True) if spent.any()]
-        if not timed:
+        if not timed and not tally.still_rows:
             return
-        spent = np.array([spent for _, spent in timed])
+        spent = np.array([spent for _, spent in timed]).reshape(-1, 3)
         rates = spent[:, 2:] / spent[:, :2]
         off = (np.abs(rates / fps - 1) > RATE_TOLERANCE).all(axis=1) & (spent[:, 2] >= _TIMED)
         named = [f"{timed[at][0]}: {rates[at, 1]:.4g} Hz" for at in np.flatnonzero(off)]
         seconds, usual_seconds, steps = spent.sum(axis=0)
-        if all(abs(steps / each / fps - 1) > RATE_TOLERANCE for each in (seconds, usual_seconds)):
+        if timed and all(abs(steps / each / fps - 1) > RATE_TOLERANCE for each in (seconds, usual_seconds)):
             advice = ["correct fps or time_scale, or resample the recording"]
             if tally.back_rows:
                 back = f"time goes back in {tally.back_rows} rows, first in {tally.back_first}"

@@ -64,8 +64,9 @@ class ColumnMapping(Config):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        if doubled := sorted({name for name in self.names if self.names.count(name) > 1}):
-            raise ValueError(f"names has {', '.join(doubled)} more than once")
+        key, labels = ("names", self.names) if self.names or self.take else ("fields", self.fields)
+        if doubled := sorted({name for name in labels if labels.count(name) > 1}):
+            raise ValueError(f"{key} has {', '.join(doubled)} more than once")
         if self.latched and self.gap_s is not None:
             raise ValueError("latched holds without limit, and gap_s is a limit: leave one out")
         if self.clip is not None and self.clip[0] >= self.clip[1]:

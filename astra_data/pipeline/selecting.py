@@ -137,6 +137,7 @@ def choose_by_trials(
                     f"use the same settings, or move {path.parent} away"
                 )
     begun, shown = there or begun, part(progress, 0.5, 1.0)
+    begun = begun.model_copy(update={"chosen": None, "mean": None, "rate": None})  # results may have been corrected
     rounds = list(begun.rounds)  # of which nothing is tried again
     sheet = Sheet(path.parent / choice.SHEET, task)
 

@@ -110,6 +110,7 @@ def test_an_unknown_column_answers_with_the_known_ones(fake: Dataset) -> None:
         fake.columns(["reward"])
     with pytest.raises(BadInputError, match=r"expected a list of columns, got the text 'action': write \['act"):
         fake.columns("action")
+    assert [*fake.columns(name for name in ["action"])] == ["action"]  # type: ignore[arg-type]
 
 
 def test_a_run_names_its_datasets(tmp_path: Path) -> None:

@@ -102,7 +102,8 @@ def test_steps_are_compared_with_those_that_float32_holds(monkeypatch: pytest.Mo
     assert south is not None and "y (up to 4.42954e+06) in steps of 0.5, but it moves by 0.63" in south[0]
     assert south[0].endswith("set offset = [4429533.0]") and told(-4_429_530 - 0.63 * steps[1:]) is None
     counted = told(2.0**24 + steps)
-    assert counted is not None and not counted[1]
+    assert counted is not None and not counted[1] and told(1e15 + steps) is not None
+    assert told(2**63 + np.arange(11, dtype=np.uint64)) is not None
     tiny = 2.0**-32 * steps
     assert told(2.0**20 + 100 * tiny) is not None and told(2.0**20 + 10 * tiny) is None  # the noise of float64
     monkeypatch.setattr(statistics, "_MOST_SAMPLES", 20)

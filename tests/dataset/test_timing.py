@@ -104,6 +104,7 @@ def test_still_ends_go_and_pauses_stay(tmp_path: Path) -> None:
         ({"without": "mode"}, "expected a condition such as 'v < 0.05'"),
         ({"without": "x < near"}, "expected a condition such as 'v < 0.05'"),
         ({"without": "mod < 3"}, "no value 'mod': did you mean 'mode'"),
+        ({"without": "next.terminated == 2"}, "next.terminated is true or false: expected one of them, got 2"),
     ],
 )
 def test_what_cannot_be_trimmed_is_told_and_nothing_written(
@@ -152,7 +153,7 @@ def test_states_at_another_rate_are_where_the_robot_was(
         np.testing.assert_allclose((2 * np.arctan2(z, w) - 3 * at + np.pi) % (2 * np.pi) - np.pi, 0, atol=1e-3)
         np.testing.assert_allclose(w**2 + z**2, 1, atol=1e-5)
     np.testing.assert_array_equal(episode.columns[ACTION], np.floor(time_s * 50 + 1e-6))
-    np.testing.assert_allclose(episode.columns["time"][:-1], 5 + time_s[:-1], atol=1e-5)
+    np.testing.assert_allclose(episode.columns["time"], 5 + time_s, atol=1e-5)
     assert episode.columns[REWARD].sum() == recorded == episode.metadata["return"]
     assert episode.columns[TERMINATED].tolist() == [*[False] * (len(episode) - 1), True]
     assert "abstract.state" not in found.features and caplog.messages[-1].endswith("abstract.state; pair it again")
@@ -169,6 +170,16 @@ def test_without_next_states_the_last_state_has_no_step_after_it(tmp_path: Path)
         open_writer.add(Episode(0, {STATE: np.arange(6, dtype=np.float32)}))
     (episode,) = made(resample(Dataset.open(tmp_path / "logs"), 5, out=tmp_path / "out"))
     assert episode.columns[STATE].tolist() == [0, 2, 4]
+
+
+def test_angles_that_are_counted_go_on(tmp_path: Path) -> None:
+    columns = [Column(name, astra={"unit": ["rad"]}) for name in (STATE, NEXT_STATE)]
+    with writer(tmp_path / "logs", columns=columns, fps=10) as open_writer:
+        for uid, angles in enumerate(np.split(4 * np.arange(9, dtype=np.float32), [2])):
+            open_writer.add(Episode(uid, {STATE: angles, NEXT_STATE: angles + 4}))
+    for episode in made(resample(Dataset.open(tmp_path / "logs"), 20, out=tmp_path / "out")):
+        first = 8 * episode.uid
+        assert episode.columns[STATE].tolist() == [*range(first, first + 2 * len(episode), 2)]
 
 
 @pytest.mark.parametrize("fps", [20, 0, -5, 2001])

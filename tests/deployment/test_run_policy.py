@@ -90,6 +90,7 @@ def test_ranges_that_are_not_known_or_have_no_width_refuse_nothing() -> None:
     [
         ({"rate_hz": 20}, "rate_hz: expected 10, got 20"),
         ({"rate_hz": 9.8}, "rate_hz: expected 10, got 9.8"),
+        ({"rate_hz": float("nan")}, "rate_hz: expected 10, got nan"),
         ({"state": ["speed", "x"]}, r"state: expected the values \['x', 'speed'\], got \['speed', 'x'\]"),
         ({"goal": []}, r"goal: expected the values \['goal_0'\], got \[\]"),
     ],

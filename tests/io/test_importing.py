@@ -66,8 +66,11 @@ def test_rows_at_the_same_time_are_told_with_their_place(tmp_path: Path) -> None
     tally = with_times(tmp_path, seconds)
     assert (tally.still_rows, tally.still_first, tally.split_points) == (3, "log.npz row 5", {})
     (tmp_path / "twice").mkdir()
-    with pytest.raises(BadInputError, match=r"stands still in 10 of 20 rows, first in .* row 1: expected one"):
-        with_times(tmp_path / "twice", np.repeat(np.arange(10), 2) / 10)
+    for still, times in ((10, np.repeat(np.arange(10), 2) / 10), (19, np.zeros(20))):
+        with pytest.raises(
+            BadInputError, match=rf"stands still in {still} of 20 rows, first in .* row 1: expected one"
+        ):
+            with_times(tmp_path / "twice", times)
     seconds[:] = np.arange(20) / 10
     seconds[7] = np.nan
     path = write_table(tmp_path / "unknown.npz", rows() | {"unused": seconds, "fell": np.zeros(20, bool)})

@@ -18,6 +18,7 @@ from astra_data.io.mapping import ColumnMapping, ImportMapping, Jump, Split, rea
         (("clip", "clop"), "clop: unknown key"),
         (("clip = [-1, 1]", "clip = [1, 1]"), "expected the lower bound first"),
         (('names = ["x", "y"]', 'names = ["x", "x"]'), "names has x more than once"),
+        (('"y"]\nscale = [0.001]\nnames = ["x", "y"]', '"x"]'), "fields has x more than once"),
         (("columns.gait", "columns.index"), "column index is filled in"),
         (('columns."next.terminated"', 'columns."next.done"'), "column next.done is filled in"),
         (('fields = ["reward"]', "fields = []"), "columns.next.reward.fields: "),

@@ -111,8 +111,10 @@ def test_a_method_of_ones_own_that_is_not_there_is_told_once() -> None:
 @pytest.mark.parametrize("seed", [-1, 2**63, 2**64])
 def test_seeds_are_those_that_every_stage_takes(seed: int) -> None:
     assert read(seeds=[0, 2**63 - 1]).seeds[1] == 2**63 - 1
-    with pytest.raises(RecipeError, match=r"seeds\.1: "):
-        read(seeds=[0, seed])
+    for seeds in ([0, seed], [seed]):
+        with pytest.raises(RecipeError, match=rf"seeds\.{len(seeds) - 1}: ") as told:
+            read(seeds=seeds)
+        assert "or more, got none" not in str(told.value)
 
 
 def test_a_run_or_a_dataset_in_place_of_a_recipe_is_told(tmp_path: Path) -> None:

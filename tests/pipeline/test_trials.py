@@ -257,6 +257,12 @@ def test_trials_by_hand_are_filled_into_the_sheet(folder: Path, predicted: list[
     shown = CliRunner().invoke(app, command)
     assert "chosen with 4 trials: " in shown.output and ": success 1.00 [0.34, 1.00]" in shown.output
     assert len(predicted) == 2 and read_manifest(folder / "select").faults(folder / "select", verify=True) == []  # type: ignore[union-attr]
+    filled = sheet.read_text()
+    sheet.write_text("\n".join(lines))
+    shown = CliRunner().invoke(app, command)
+    assert "0 trials are made: fill in trials.csv" in shown.output and "chosen with" not in shown.output
+    sheet.write_text(filled)
+    assert "chosen with 4" in CliRunner().invoke(app, command).output
     with pytest.raises(BadInputError, match="by_hand = False, found 4 made with True: use the same settings"):
         choose_by_trials(folder, 4, field=2)
     recipe.write_text(json.dumps(json.loads(recipe.read_text()) | {"task": f"{ROOT}/tests/small_cart.py:LOGS_ALONE"}))

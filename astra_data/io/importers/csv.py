@@ -36,8 +36,9 @@ def delimiter_of(name: str) -> str:
 def whole_lines(source: Source, name: str) -> tuple[bytes, bool]:
     """Return the file `name` without a last line that ends within a row, and whether there was such a line.
 
-    That line has no end and fewer fields than the header, as where a battery went empty; with quotes it is left to
-    the parser. Raise BadInputError if the file is no UTF-8, or its header no names parted as its name tells.
+    That line has no end and fewer fields than the header, or nothing in the last, as where a battery went empty;
+    with quotes it is left to the parser. Raise BadInputError if the file is no UTF-8, or its header no names parted as
+    its name tells.
     """
     with source.open() as stream:
         content = stream.read()
@@ -60,7 +61,8 @@ def whole_lines(source: Source, name: str) -> tuple[bytes, bool]:
         )
     tail = content[max(content.rfind(b"\n"), content.rfind(b"\r")) + 1 :]
     mark = delimiter.encode()
-    is_torn = 0 < len(tail) < len(content) and tail.count(mark) < header.count(mark) and b'"' not in header + tail
+    is_short = tail.count(mark) < header.count(mark) or tail.endswith(mark)
+    is_torn = 0 < len(tail) < len(content) and is_short and b'"' not in header + tail
     return content[: len(content) - len(tail)] if is_torn else content, is_torn
 
 
@@ -132,7 +134,7 @@ def _joined(source: Source, mapping: ImportMapping) -> Iterator[Block]:
         }
     values = tables[main]
     now = values[time]
-    is_known = np.isfinite(now)
+    is_known = np.ones(len(now), bool)
     for name in rest:
         times = tables[name].pop(time)
         if not (np.diff(times) >= 0).all():
@@ -140,19 +142,22 @@ def _joined(source: Source, mapping: ImportMapping) -> Iterator[Block]:
         last = np.searchsorted(times, now, side="right") - 1
         is_known &= last >= 0
         gap = (mapping.split.gap_s or np.inf) / mapping.time_scale
-        is_known[is_known] &= now[is_known] - times[last[is_known]] <= gap
+        # Rows without a time are refused, or left out, as those of a single file.
+        is_known[is_known] &= ~(now[is_known] - times[last[is_known]] > gap)
         values |= {field: column[last] for field, column in tables[name].items() if len(times)}
     kept = np.flatnonzero(is_known)
     if len(now) and not len(kept):
         raise BadInputError(f"{source}: no row has rows of {', '.join(rest)} before it that are recent enough")
     begins = np.flatnonzero(np.diff(kept, prepend=-2) > 1).tolist()
+    lost = f"left out {len(now) - len(kept)} rows without recent enough ones of {', '.join(rest)}"
+    notes = (lost,) if len(kept) < len(now) else ()
 
     def line(row: int) -> int:
         return line_of(source.parts[main], int(kept[row]))
 
     for first, rows in zip(begins, np.split(kept, begins[1:]), strict=False):
         part = {field: column[rows] for field, column in values.items()}
-        yield Block(part, str(source), starts=first > 0, row=first, line=line)
+        yield Block(part, str(source), starts=first > 0, row=first, line=line, notes=() if first else notes)
 
 
 def _plain(fields: Iterable[str]) -> list[str]:

@@ -164,7 +164,7 @@ def _groups(h5py: Any, file: Any, pattern: str | None, origin: str) -> list[Any]
             if not isinstance(group.get(name, getlink=True), h5py.HardLink):
                 place = f"{origin}{group.name.rstrip('/')}/{name}"
                 raise BadInputError(f"{place} is a link; replace it by a copy of its target")
-        groups = [group[name] for group, name in inside]
+        groups = [group[name] for group, name in inside if isinstance(group[name], h5py.Group)]
     if not groups:
         raise BadInputError(f"{origin}: no groups '{pattern}'; it has {', '.join(list(file)[:10])}")
     return groups

@@ -27,7 +27,10 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
         text = stream.read(LIMIT_BYTES + 1)
     if len(text) > LIMIT_BYTES:
         raise BadInputError(f"{source}: expected at most {LIMIT_BYTES // 2**20} MB of JSON, split the file")
-    fields = json.loads(text, object_pairs_hook=_once)
+    try:
+        fields = json.loads(text, object_pairs_hook=_once)
+    except BadInputError as error:
+        raise BadInputError(f"{source}: {error}") from None
     if isinstance(fields, list) and fields and all(isinstance(row, dict) for row in fields):
         rows = [_picked(row, names, f"{source} row {number}") for number, row in enumerate(fields)]
         yield replace(_block(rows, names, origin), known=_flat(fields[0]))

@@ -1,6 +1,7 @@
 """Parquet: a column per field, of numbers or of lists that are equally long."""
 
 from collections.abc import Iterator
+from contextlib import suppress
 
 import numpy as np
 import pyarrow as pa
@@ -55,8 +56,9 @@ def _array(column: pa.Array, origin: str) -> Array:
         return _array(column.cast(pa.int32() if kind.bit_width == 32 else pa.int64()), origin)
     if pa.types.is_decimal(kind):
         return _array(column.cast(pa.float64()), origin)
-    if column.null_count and pa.types.is_floating(kind):
-        column = column.fill_null(float("nan"))
+    if column.null_count and (pa.types.is_floating(kind) or pa.types.is_integer(kind)):
+        with suppress(pa.ArrowInvalid):  # of integers that no float64 is
+            column = (column.cast(pa.float64()) if pa.types.is_integer(kind) else column).fill_null(float("nan"))
     if column.null_count:
         raise BadInputError(f"{origin}: {column.null_count} values are missing, and {kind} has no NaN")
     if pa.types.is_boolean(kind):

@@ -37,7 +37,7 @@ def test_integers_that_floats_would_alter_are_told(tmp_path: Path, last: str) ->
 
 
 def test_cells_are_numbers_flags_or_nothing(tmp_path: Path) -> None:
-    (tmp_path / "log.csv").write_text("whole,float,flag,gap\n9007199254740993,0.5,true,1\n-2,1e3,false,")
+    (tmp_path / "log.csv").write_text("whole,float,flag,gap\n9007199254740993,0.5,true,1\n-2,1e3,false,\n")
     columns = {name: {"fields": (name,)} for name in ("whole", "float", "flag", "gap")}
     mapping = ImportMapping.model_validate({"name": "n", "task": "t", "fps": 1, "columns": columns})
     source = Source(tmp_path / "log.csv", None, tmp_path / "log.csv")
@@ -98,7 +98,7 @@ def test_a_last_line_that_is_cut_off_is_rejected_alone(tmp_path: Path, end: str)
     """In a file, and in an archive."""
     rows = 3
     whole = f"x,y,z{end}" + "".join(f"{row},{row}.5,0000{end}" for row in range(rows))
-    for number, torn in enumerate((f"{rows},", f"{rows}")):
+    for number, torn in enumerate((f"{rows},", f"{rows}", f"{rows},0,")):
         log = tmp_path / "log.csv"
         log.write_bytes((whole + torn).encode())
         archive = tmp_path / "logs.tar.gz"
@@ -152,7 +152,7 @@ gap_s = 0.15
 def test_files_of_one_recording_are_joined_by_time(tmp_path: Path) -> None:
     joined(tmp_path / "logs", "run1_")
     joined(tmp_path / "logs/other", "", lost=slice(20, 30))
-    dataset, _ = imported(tmp_path, tmp_path / "logs", JOINED)
+    dataset, report = imported(tmp_path, tmp_path / "logs", JOINED)
     before, after, first = dataset.episodes()
     # The first command comes at 0.3 s, so the first row is that of the same time.
     assert first.columns["observation.state"][:2].tolist() == [[3, -3], [4, -4]]
@@ -162,6 +162,11 @@ def test_files_of_one_recording_are_joined_by_time(tmp_path: Path) -> None:
     assert before.columns["observation.state"][[0, -1], 0].tolist() == [3, 13]
     assert after.columns["observation.state"][0, 0] == 18 and after.columns["action"][:2].tolist() == [30, 32]
     assert len(dataset.description["config"]["recordings"]) == 4
+    lost = "left out {} rows without recent enough ones of control_state.csv"
+    assert all(lost.format(rows) in str(report) for rows in (3, 6))
+    (state := tmp_path / "logs/run1_state.csv").write_text(state.read_text().replace("\n900,", "\n,"))
+    with pytest.raises(BadInputError, match=r"t in 1 row, run1_state\.csv line 11"):
+        imported(tmp_path / "again", tmp_path / "logs", JOINED)
 
 
 def test_files_that_cannot_be_joined_are_refused(tmp_path: Path) -> None:

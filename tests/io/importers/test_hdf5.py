@@ -148,11 +148,11 @@ def test_a_file_of_groups_asks_for_their_pattern(tmp_path: Path) -> None:
         for trial in range(12):
             for name, values in rows(trial).items():
                 file[f"flights/trial_{trial}/{name}"] = values
-        file["notes/x"] = np.zeros(3)
+        file["notes/x"] = file["flights/made"] = np.zeros(3)
     told = r"the fields are in 12 groups, such as flights/trial_0: give .* episodes = \"flights/trial_\*\""
     with pytest.raises(BadInputError, match=told):
         imported(tmp_path, path)
-    dataset, _ = imported(tmp_path, path, 'episodes = "flights/trial_*"\n' + MAPPING)
+    dataset, _ = imported(tmp_path, path, 'episodes = "flights/*"\n' + MAPPING)
     assert len(dataset) >= 12
     with h5py.File(path, "a") as file:
         file["x"] = np.zeros(3)  # some of the fields

@@ -65,6 +65,9 @@ def test_a_line_that_is_no_row_is_told_with_its_place(tmp_path: Path, line: str,
 
 
 def test_a_last_line_that_is_cut_off_is_counted(tmp_path: Path) -> None:
+    (path := tmp_path / "log.json").write_text('{"x": 1, "x": 2}')
+    with pytest.raises(BadInputError, match=r"log\.json: an object has x more than once"):
+        list(json.read(Source(path, None, path), LISTS))
     path = tmp_path / "log.jsonl"
     for tail, torn, more in (("", 0, 0), ('{"x": 1, "on": tr', 1, 0), ('{"x": 1, "on": true}', 0, 1)):
         path.write_text('{"x": 1, "on": true}\n' * 3 + tail)

@@ -44,6 +44,7 @@ def test_every_kind_of_number_and_list_is_read(tmp_path: Path) -> None:
             "time": pa.array(times, pa.timestamp("us")),
             "exact": [Decimal("1.25"), Decimal("2.50"), Decimal("-3.75")],
             "lost": [1.0, None, 3.0],
+            "count": [1, None, 3],
         },
     )
     np.testing.assert_array_equal(got["observation.state"], [[0, 1], [2, 3], [4, 5]])
@@ -54,7 +55,8 @@ def test_every_kind_of_number_and_list_is_read(tmp_path: Path) -> None:
     assert got["flag"].dtype == bool and got["gait"].tolist() == ["walk", "run", "walk"]
     assert got["level"].tolist() == [3, 1, 3] and np.diff(got["time"]).tolist() == [20_000, 20_000]
     assert got["exact"].tolist() == [1.25, 2.5, -3.75]
-    np.testing.assert_array_equal(got["lost"], [1.0, np.nan, 3.0])
+    for name in ("lost", "count"):
+        np.testing.assert_array_equal(got[name], [1.0, np.nan, 3.0])
 
 
 @pytest.mark.parametrize(
@@ -65,7 +67,7 @@ def test_every_kind_of_number_and_list_is_read(tmp_path: Path) -> None:
         (pa.array([[1.0, 2.0], None, [4.0, 5.0]], pa.list_(pa.float64(), 2)), "expected lists of one length"),
         ([[1.0], [2.0, 3.0, 4.0], [5.0, 6.0]], "expected lists of one length"),
         ([[1.0], [2.0], [5.0, 6.0]], "expected lists of one length"),
-        ([1, None, 3], "1 values are missing, and int64 has no NaN"),
+        ([2**53 + 1, None, 3], "1 values are missing, and int64 has no NaN"),
         ([True, None, False], "1 values are missing, and bool has no NaN"),
     ],
 )
