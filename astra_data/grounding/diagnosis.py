@@ -108,7 +108,6 @@ def diagnose(dataset: str | Path, simulator: str, progress: Progress = silent) -
         *_of_responses(responses, source.info["fps"]),
         *_of_hidden_state([*explained.values()], shown),
         *_of_commands(log, commands),
-        *_of_rates(log, source.info["fps"]),
         *_of_forecast(forecast, missed),
     )
     return Diagnosis(
@@ -484,15 +483,3 @@ def _of_commands(log: _Log, commands: Mapping[str, tuple[float, float, float, fl
     if len(values) > 1 and values[0] < 0.02 * values[-1] and log.action.std(axis=0).min() > 0:
         together = " and ".join(np.array([*commands])[np.abs(directions[:, 0]) > 0.3])
         yield Finding("warning", f"{together} only ever vary together", "vary them one at a time: their effects mix")
-
-
-def _of_rates(log: _Log, fps: float) -> Iterator[Finding]:
-    """Yield a warning if the state is repeated from step to step: it comes at a lower rate."""
-    values = log.target_state
-    rate = fps * float((values[1:] != values[:-1]).any(axis=1).mean()) if len(values) > 1 else fps
-    if rate < 0.8 * fps:
-        yield Finding(
-            "warning",
-            f"{keys.STATE} changes {rate:.3g} times a second, of {fps:g} rows",
-            "it is sampled more slowly than it was logged: import with its own rate (`fps`)",
-        )

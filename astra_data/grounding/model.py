@@ -236,12 +236,11 @@ def _masked_mean(values: Tensor, mask: Tensor) -> Tensor:
 
 @torch.no_grad()
 def telemetry(model: GroundingModel, episodes: PairedEpisodes, weights: LossWeights) -> dict[str, float | None]:
-    """Return R² of each trained head on `episodes`, None without variance, and the latent's deviation and rank."""
+    """Return R² of each trained head on `episodes`, None without variance."""
     windows = episodes.windows
     latent, _ = model.encode(windows)
     mask = windows.mask.bool()
-    samples = latent[mask]
-    if not samples.isfinite().all():
+    if not latent[mask].isfinite().all():
         raise BadInputError("the fit diverged: lower learning_rate in [ground], or look at the data's values")
     corrected = model.correct(latent, windows.action, windows.simulated_next)
     figures: dict[str, float | None] = {"r2_state": correction_r2(corrected, windows, model)}
@@ -253,13 +252,6 @@ def telemetry(model: GroundingModel, episodes: PairedEpisodes, weights: LossWeig
         mean, _ = model.predict_latent(latent[:, :-1], windows.action[:, :-1])
         both = mask[:, :-1] & mask[:, 1:]
         figures["r2_latent"] = _r2(mean[both], latent[:, 1:][both])
-    figures["latent_std"] = figures["latent_rank"] = None
-    if len(samples) < 2:
-        return figures
-    eigenvalues = torch.linalg.eigvalsh(torch.cov(samples.T)).clamp_min(1e-12)
-    shares = eigenvalues / eigenvalues.sum()
-    figures["latent_std"] = float(samples.std(0).mean())
-    figures["latent_rank"] = float(torch.exp(-(shares * shares.log()).sum()))
     return figures
 
 

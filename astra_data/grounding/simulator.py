@@ -2,7 +2,6 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self
 
 from astra_data.core.lazy import Tensor
@@ -158,9 +157,4 @@ class FittedGrounding(Grounding, ABC):
         """Rebuild it on `device`, with frozen parameters."""
 
 
-@dataclass(frozen=True)
-class NoGrounding(Grounding):
-    """Leave the simulator as it is, except for varied parameters if given."""
-
-
-NO_GROUNDING = NoGrounding()
+NO_GROUNDING = Grounding()

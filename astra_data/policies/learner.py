@@ -159,8 +159,8 @@ Points = Sequence[Mapping[str, float | None]]
 
 _RECENT = 5  # points of the learning curve over which success is averaged
 MASTERED = 0.8  # success at which a simulator is mastered
-NEARLY_ALWAYS = 0.95  # success of training episodes from which on little is left to learn
-FAST = 6.0  # pace of a training then
+_NEARLY_ALWAYS = 0.95  # success of training episodes from which on little is left to learn
+_FAST = 6.0  # pace of a training then
 _GROWTH_SHARE = 0.25  # share of the training over which penalties grow from 0 to full size
 _PATIENCE_SHARE = 0.4  # share of the training after which they wait for no more than a mastered simulator
 
@@ -169,6 +169,11 @@ def recent_success(points: Points) -> float:
     """Return the mean success of the last training episodes; 0 if none has ended."""
     recent = [success for point in points[-_RECENT:] if (success := point.get("success")) is not None]
     return fmean(recent) if recent else 0.0
+
+
+def pace(points: Points, penalty_scale: float) -> float:
+    """Return how fast to go on after `points`: faster where little is left to learn, with all penalties."""
+    return _FAST if penalty_scale == 1.0 and recent_success(points) >= _NEARLY_ALWAYS else 1.0
 
 
 def penalty_scale(points: Points) -> float:
@@ -180,7 +185,7 @@ def penalty_scale(points: Points) -> float:
     for number, point in enumerate(points, 1):
         now = float(point["share"] or 0.0)
         change = (now - before) / _GROWTH_SHARE
-        needed = NEARLY_ALWAYS if now < _PATIENCE_SHARE else MASTERED
+        needed = _NEARLY_ALWAYS if now < _PATIENCE_SHARE else MASTERED
         scale += change if recent_success(points[max(0, number - _RECENT) : number]) >= needed else -change
         scale, before = min(1.0, max(0.0, scale)), now
     return scale

@@ -21,16 +21,7 @@ from astra_data.grounding.files import grounding_at
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.simulator import Grounding
 from astra_data.policies.episodes import ObservedTargetEnv, Reached, reached_in_own_world
-from astra_data.policies.learner import (
-    FAST,
-    MASTERED,
-    NEARLY_ALWAYS,
-    Learner,
-    SavedPolicy,
-    lately,
-    penalty_scale,
-    recent_success,
-)
+from astra_data.policies.learner import MASTERED, Learner, SavedPolicy, lately, pace, penalty_scale
 from astra_data.policies.ppo import Ppo, PpoConfig
 from astra_data.policies.running_policy import POLICY, Observed, PolicyFile
 from astra_data.policies.sac import Sac, SacConfig
@@ -192,7 +183,7 @@ def optimize(learner: Learner, env: TrainingEnv, training: Training, checkpoint:
     ramps = training.is_plus and isinstance(learner, Ppo) and not is_lasting
     while not learner.done:
         env.penalty_scale = penalty_scale(points) if ramps else 1.0
-        learner.pace = FAST if env.penalty_scale == 1.0 and recent_success(points) >= NEARLY_ALWAYS else 1.0
+        learner.pace = pace(points, env.penalty_scale)
         metrics = learner.iterate()
         # JSON has no NaN: undefined figures, such as the success rate of no episodes, are null.
         known = {name: None if math.isnan(value) else value for name, value in metrics.items()}

@@ -356,18 +356,6 @@ def test_shares_of_variance_are_those_of_real_steps() -> None:
     assert telemetry(two, residual, WEIGHTS)["r2_reward"] == pytest.approx(r2(whole, reward[paid]), rel=1e-4)
 
 
-def test_the_latents_spread_and_rank() -> None:
-    given = episodes()
-    used = model_of(given)
-    samples = used.encode(given.windows)[0][given.windows.mask.bool()]
-    figures = telemetry(used, given, WEIGHTS)
-    assert figures["latent_std"] == pytest.approx(float(samples.std(0).mean()), rel=1e-5)
-    shares = torch.linalg.svdvals(samples - samples.mean(0)).square()
-    shares = shares / shares.sum()
-    rank = float((-(shares * shares.clamp_min(1e-30).log()).sum()).exp())
-    assert figures["latent_rank"] == pytest.approx(rank, rel=1e-3) and 1.0 < rank < 6.0
-
-
 def test_a_fit_that_diverged_is_told() -> None:
     used = model_of(episodes())
     next(used.encoder.parameters()).data.fill_(torch.nan)

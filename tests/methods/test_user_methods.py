@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from rail_run import SMALL as RAIL
 from small_cart import GIVEN, TASK, Rail
 from toy_episodes import toy_episodes
 
@@ -29,25 +30,9 @@ EXAMPLES = ROOT / "recipes/examples/methods"
 ANTS = TASKS["antmaze-umaze"]
 CARTS = user_object(f"{ROOT}/recipes/examples/cart/cart.py:TASK")
 pytestmark = pytest.mark.usefixtures("forgotten_methods")
-SMALL = """
-[collect]
-episodes = 6
-max_steps = 12
-hold_s = [0.1, 0.4]
-[ground]
-updates = 3
-window = 5
-held_out_share = 0.25
-[train]
-num_envs = 4
-rollout_steps = 8
-total_steps = 32
-hidden_sizes = [8]
-memory_size = 4
-tries = 1
-[evaluate]
-episodes = 3
-"""
+SMALL = RAIL.replace("memory_size = 4", "memory_size = 4\ntries = 1").replace(
+    'max_steps = 40\nstart = "task"', "max_steps = 12"
+)
 
 
 def recipe(folder: Path, methods: str, own: str) -> Path:

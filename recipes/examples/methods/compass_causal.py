@@ -14,7 +14,7 @@ from astra_data.core.config import AtOnce, Config, Count
 from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import derive
 from astra_data.grounding.open_loop import distances
-from astra_data.grounding.simulator import NoGrounding
+from astra_data.grounding.simulator import Grounding
 from astra_data.methods.method import Method, Table
 from astra_data.worlds.variation import Variation
 
@@ -124,7 +124,7 @@ def beginnings(episodes, length):
 
 
 @dataclass(frozen=True)
-class IdentifiedParameters(NoGrounding):
+class IdentifiedParameters(Grounding):
     kind = "compass_causal"
 
     variation: Variation
