@@ -77,9 +77,9 @@ def trim(
 def resample(source: Dataset, fps: int, *, name: str | None = None, out: Path | None = None) -> Path:
     """Write `source` at another rate: commands are held, states interpolated, rewards summed, times true.
 
-    Angles (unit rad or deg) are interpolated the shorter way, quaternions as such. Columns of a pairing are left
-    out, since steps of another length land elsewhere: pair it again. What is left of an episode after its last
-    whole step adds its reward and ending to that step; an episode shorter than a step is left out.
+    Angles (unit rad or deg) within a turn are interpolated the shorter way, quaternions as such. Columns of a
+    pairing are left out, since steps of another length land elsewhere: pair it again. What is left of an episode
+    after its last whole step adds its reward and ending to that step; one shorter than a step is left out.
     """
     most = _FINEST * source.info["fps"]
     if not 1 <= fps <= most or fps == source.info["fps"]:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import fsspec
 import pytest
-from fake_dataset import write_fake
+from fake_dataset import DESCRIPTION, write_fake
 from fsspec.implementations.local import LocalFileSystem
 from shared_files import contents
 
@@ -73,8 +73,9 @@ def test_what_is_there_already_is_left_alone(fake: Dataset, shared: Path, tmp_pa
     (shared / DATA).unlink()
     assert pull(source(shared), out=tmp_path / "out").content_hash == first.content_hash
     write_fake(tmp_path / "other", fps=10)
+    write_fake(tmp_path / "named", description={**DESCRIPTION, "name": "namesake"})
     (tmp_path / "file").touch()
-    for out in (tmp_path / "other", tmp_path, tmp_path / "file"):
+    for out in (tmp_path / "other", tmp_path / "named", tmp_path, tmp_path / "file"):
         with pytest.raises(BadInputError, match="exists already and holds something else"):
             pull(source(shared), out=out)
 
