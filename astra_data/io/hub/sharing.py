@@ -205,7 +205,7 @@ def _present(target: Path, description: Mapping[str, Any], sums: Mapping[str, st
     changed = stores.altered(target, sums)
     try:
         dataset = Dataset.open(target)
-        is_other = any(dataset.description[key] != description.get(key) for key in ("name", "content_hash"))
+        is_other = any(dataset.description.get(key) != description.get(key) for key in ("name", "content_hash"))
     except AstraDataError as error:
         if isinstance(error, CorruptDatasetError) and len(changed) < len(sums):
             raise CorruptDatasetError(f"{error} Delete it, or pull to another folder.") from error

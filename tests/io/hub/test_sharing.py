@@ -5,6 +5,7 @@ import fcntl
 import hashlib
 import json
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -75,7 +76,8 @@ def test_what_is_there_already_is_left_alone(fake: Dataset, shared: Path, tmp_pa
     write_fake(tmp_path / "other", fps=10)
     write_fake(tmp_path / "named", description={**DESCRIPTION, "name": "namesake"})
     (tmp_path / "file").touch()
-    for out in (tmp_path / "other", tmp_path / "named", tmp_path, tmp_path / "file"):
+    plain = shutil.copytree(first.root, tmp_path / "plain", ignore=shutil.ignore_patterns("astra"))
+    for out in (tmp_path / "other", tmp_path / "named", plain, tmp_path, tmp_path / "file"):
         with pytest.raises(BadInputError, match="exists already and holds something else"):
             pull(source(shared), out=out)
 
