@@ -19,6 +19,7 @@ STEPS = (5, 9, 4)
 """Of each trial: nobody recorded the next state of its last row, but the second ends in a fall."""
 TABLES = ("log.csv", "log.npz", "log.h5", "log.json", "log.jsonl", "log.parquet")
 
+LOG = 'name = "log"\ntask = "walk"\nfps = 10\n'
 MAPPING = """
 name = "log"
 terminal = "stand_still"

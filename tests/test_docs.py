@@ -269,6 +269,12 @@ def test_nothing_is_left_to_fill_in() -> None:
         assert re.findall(r"^[A-Z_]{4,}$|\b[A-Z]+_MINUTES\b|\bTODO\b", text, re.MULTILINE) == [], page
 
 
+def test_the_rows_of_a_table_have_as_many_cells() -> None:
+    for page, text in PAGES.items():
+        for table in re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE):
+            assert len({len(re.findall(r"(?<!\\)\|", line)) for line in table.splitlines()}) == 1, (page, table)
+
+
 def checks() -> list[str]:
     lines = map(str.strip, (ROOT / ".ci" / "run").read_text().splitlines())
     return [line for line in lines if line.startswith("uv run")]

@@ -27,6 +27,7 @@ _COMPARED = {"<=": le, ">=": ge, "==": eq, "!=": ne, "<": lt, ">": gt}
 _CONDITION = re.compile(r"\s*(.+?)\s*(<=|>=|==|!=|<|>)\s*(\S+)\s*")
 _OBSERVED = re.compile(r"(next\.)?observation\.")
 _FINEST = 100  # times the recorded rate
+type _Turns = dict[int, float]  # full turns of the angles in a column, by their index
 
 
 def trim(
@@ -91,8 +92,7 @@ def resample(source: Dataset, fps: int, *, name: str | None = None, out: Path | 
             f"divides {source.info['fps']}, got {fps}"
         )
     schema = [column for column in source.schema if not column.name.startswith("abstract.")]
-    found = source.statistics()
-    turns = [(column, _turns(column, found[column.name])) for column in schema]
+    turns = [(column, _turns(column, source)) for column in schema]
     slower = (slow for episode in source.episodes() if (slow := _resampled(episode, turns, source.info["fps"], fps)))
     config = {"fps": fps, "from_fps": source.info["fps"]}
     made = _write(source, "columns", schema, slower, fps, stage="resample", config=config, name=name, out=out)
@@ -171,9 +171,7 @@ def _facts(columns: Mapping[str, Array], metadata: Mapping[str, Any]) -> dict[st
     return {**metadata, **{key: value for key, value in outcome_of(columns).items() if key in metadata}}
 
 
-def _resampled(
-    episode: Episode, turns: Sequence[tuple[Column, dict[int, float]]], before: int, fps: int
-) -> Episode | None:
+def _resampled(episode: Episode, turns: Sequence[tuple[Column, _Turns]], before: int, fps: int) -> Episode | None:
     has_next = names.NEXT_STATE in episode.columns
     duration_s = (len(episode) - (not has_next)) / before
     steps = int(duration_s * fps + 1e-6) + (not has_next)
@@ -208,14 +206,17 @@ def _resampled(
     return replace(episode, columns=columns, metadata=_facts(columns, episode.metadata), cameras=cameras)
 
 
-def _turns(column: Column, found: Mapping[str, Array]) -> dict[int, float]:
+def _turns(column: Column, source: Dataset) -> _Turns:
     """Return the full turns of the angles in a column by index; those that range over more are counted, and go on."""
+    angles = {index: TURNS[unit] for index, unit in enumerate(column.units) if unit in TURNS}
+    if not angles:  # of a recording, statistics take a reading of all values
+        return angles
+    found = source.statistics()[column.name]
     ranges = np.ravel(found["max"]) - np.ravel(found["min"])
-    units = zip(column.units, ranges, strict=False)
-    return {n: TURNS[unit] for n, (unit, wide) in enumerate(units) if unit in TURNS and wide <= 1.001 * TURNS[unit]}
+    return {index: turn for index, turn in angles.items() if ranges[index] <= 1.001 * turn}
 
 
-def _interpolated(values: Floats, at: Floats, column: Column, turns: Mapping[int, float]) -> Floats:
+def _interpolated(values: Floats, at: Floats, column: Column, turns: _Turns) -> Floats:
     """Return rows of `values` (N, D) `at` places between 0 and N - 1, (M, D); `turns` are those of wrapped angles."""
     recorded = values
     values = values.copy()

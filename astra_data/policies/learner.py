@@ -161,7 +161,7 @@ _RECENT = 5  # points of the learning curve over which success is averaged
 MASTERED = 0.8  # success at which a simulator is mastered
 _NEARLY_ALWAYS = 0.95  # success of training episodes from which on little is left to learn
 _FAST = 6.0  # pace of a training then
-_GROWTH_SHARE = 0.25  # share of the training over which penalties grow from 0 to full size
+_GROWTH_SHARE = 0.25  # share of the training over which penalties grow; from the start, they teach robots to stand
 _PATIENCE_SHARE = 0.4  # share of the training after which they wait for no more than a mastered simulator
 
 
@@ -171,16 +171,13 @@ def recent_success(points: Points) -> float:
     return fmean(recent) if recent else 0.0
 
 
-def pace(points: Points, penalty_scale: float) -> float:
+def pace(points: Points, penalties: float) -> float:
     """Return how fast to go on after `points`: faster where little is left to learn, with all penalties."""
-    return _FAST if penalty_scale == 1.0 and recent_success(points) >= _NEARLY_ALWAYS else 1.0
+    return _FAST if penalties == 1.0 and recent_success(points) >= _NEARLY_ALWAYS else 1.0
 
 
 def penalty_scale(points: Points) -> float:
-    """Return the factor on penalties (0 to 1) after `points`: grows while episodes succeed, else falls.
-
-    With penalties from the start, robots learn to stand.
-    """
+    """Return the factor on penalties (0 to 1) after `points`: grows while episodes succeed, else falls."""
     scale, before = 0.0, 0.0
     for number, point in enumerate(points, 1):
         now = float(point["share"] or 0.0)

@@ -17,17 +17,13 @@ from hypothesis.extra import numpy as npst
 from mcap_recordings import MAPPING as MCAP_MAPPING
 from mcap_recordings import log, write_json, write_protobuf, write_ros2
 from minari_recordings import episodes, write_minari
-from recordings import MAPPING, TABLES, rows, write_table
+from recordings import LOG, MAPPING, TABLES, rows, write_table
 
 from astra_data.core.errors import AstraDataError
 from astra_data.dataset.reader import Dataset
 from astra_data.io.importing import import_dataset
 
-MINARI_MAPPING = """
-name = "log"
-task = "walk"
-fps = 10
-[columns."observation.state"]
+MINARI_MAPPING = f"""{LOG}[columns."observation.state"]
 fields = ["observations/achieved_goal"]
 [columns.action]
 fields = ["actions"]

@@ -5,7 +5,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from recordings import MAPPING, imported, rows, write_table
+from recordings import LOG, MAPPING, imported, rows, write_table
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import Array
@@ -106,11 +106,7 @@ def test_nothing_is_left_out_without_a_mapping(tmp_path: Path) -> None:
         import_dataset([path], name="log", fps=10, out=tmp_path / "out", skip_bad=True)
 
 
-STACKED = """
-name = "log"
-task = "walk"
-fps = 10
-[columns."observation.state"]
+STACKED = f"""{LOG}[columns."observation.state"]
 fields = ["state"]
 [columns.action]
 fields = ["command"]

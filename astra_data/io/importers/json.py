@@ -4,6 +4,7 @@ import json
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -27,10 +28,7 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
         text = stream.read(LIMIT_BYTES + 1)
     if len(text) > LIMIT_BYTES:
         raise BadInputError(f"{source}: expected at most {LIMIT_BYTES // 2**20} MB of JSON, split the file")
-    try:
-        fields = json.loads(text, object_pairs_hook=_once)
-    except BadInputError as error:
-        raise BadInputError(f"{source}: {error}") from None
+    fields = json.loads(text, object_pairs_hook=partial(_once, origin=f"{source}: "))
     if isinstance(fields, list) and fields and all(isinstance(row, dict) for row in fields):
         rows = [_picked(row, names, f"{source} row {number}") for number, row in enumerate(fields)]
         yield replace(_block(rows, names, origin), known=_flat(fields[0]))
@@ -103,11 +101,11 @@ def _block(rows: Iterable[Sequence[Any]], names: Sequence[str], origin: str) -> 
     return Block(columns, origin)
 
 
-def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _once(pairs: list[tuple[str, Any]], origin: str = "") -> dict[str, Any]:
     """Return an object whose names are all different."""
     fields = dict(pairs)
     if len(fields) < len(pairs):
         counts = Counter(name for name, _ in pairs)
         doubled = sorted(name for name, count in counts.items() if count > 1)
-        raise BadInputError(f"an object has {', '.join(doubled)} more than once")
+        raise BadInputError(f"{origin}an object has {', '.join(doubled)} more than once")
     return fields

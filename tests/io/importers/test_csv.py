@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from recordings import MAPPING, imported, rows, write_table
+from recordings import LOG, MAPPING, imported, rows, write_table
 
 from astra_data.core.errors import BadInputError
 from astra_data.io.importers import csv
@@ -133,11 +133,7 @@ def joined(folder: Path, prefix: str, *, lost: slice = slice(0)) -> None:
     (folder / f"{prefix}control_state.csv").write_text("t,u\n" + "".join(commands))
 
 
-JOINED = """
-name = "log"
-task = "walk"
-fps = 10
-time = "t"
+JOINED = f"""{LOG}time = "t"
 time_scale = 0.001
 [columns."observation.state"]
 fields = ["state.csv:x", "state.csv:y"]

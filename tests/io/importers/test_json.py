@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from recordings import LENGTHS, MAPPING, imported, rows, write_table
+from recordings import LENGTHS, LOG, MAPPING, imported, rows, write_table
 
 from astra_data.core.errors import BadInputError
 from astra_data.io.importers import json
@@ -95,11 +95,7 @@ def test_objects_in_objects_are_fields_with_both_names(tmp_path: Path, kind: str
         path.write_text(dumps({"pose": {"at": at, "yaw": {"rad": yaw}}, "u": list(range(6))}))
     else:
         path.write_text(dumps(rows_) if kind == "list" else "\n".join(map(dumps, rows_)))
-    mapping = """
-name = "log"
-task = "walk"
-fps = 10
-[columns."observation.state"]
+    mapping = f"""{LOG}[columns."observation.state"]
 fields = ["pose/at", "pose/yaw/rad"]
 """
     dataset, report = imported(tmp_path, path, mapping)

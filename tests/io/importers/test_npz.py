@@ -3,7 +3,7 @@ from zipfile import ZipFile
 
 import numpy as np
 import pytest
-from recordings import imported, rows, write_table
+from recordings import LOG, imported, rows, write_table
 
 from astra_data.core.errors import BadInputError
 from astra_data.io.importing import import_dataset
@@ -34,11 +34,7 @@ def bomb(path: Path, rows: int) -> Path:
     return path
 
 
-BOMB_MAPPING = """
-name = "log"
-task = "walk"
-fps = 10
-[columns."observation.state"]
+BOMB_MAPPING = f"""{LOG}[columns."observation.state"]
 fields = ["x", "y"]
 [columns.action]
 fields = ["command"]
