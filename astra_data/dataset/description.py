@@ -89,20 +89,18 @@ class ContentHash:
     """A running sha256 over the values of all columns, independent of their order and the files' encoding."""
 
     def __init__(self) -> None:
-        self._columns: dict[str, Any] = {}
-        self._kinds: dict[str, str] = {}
+        self._columns: dict[str, tuple[str, Any]] = {}
 
     def update(self, name: str, values: Array) -> None:
         """Append `values` (n,) or (n, size), contiguous, to column `name`."""
-        if name not in self._columns:
-            self._columns[name], self._kinds[name] = hashlib.sha256(), f"{values.dtype.name}{values.shape[1:]}"
-        self._columns[name].update(values.data)
+        _, running = self._columns.setdefault(name, (f"{values.dtype.name}{values.shape[1:]}", hashlib.sha256()))
+        running.update(values.data)
 
     def hexdigest(self) -> str:
         """Return the hash of all values so far."""
         total = hashlib.sha256()
-        for name in sorted(self._columns):
-            total.update(f"{name}\0{self._kinds[name]}\0".encode() + self._columns[name].digest())
+        for name, (kind, running) in sorted(self._columns.items()):
+            total.update(f"{name}\0{kind}\0".encode() + running.digest())
         return total.hexdigest()
 
 

@@ -162,7 +162,8 @@ def merge(
     names = _merged_uids(sources, new_uids)
     config = {"datasets": [source.reference for source in sources], "new_uids": new_uids}
     described: dict[str, Any] = {"stage": "merge", "config": config, "name": name, "out": out}
-    with next_version(first, "episodes", others=others, task=" / ".join(tasks), **described) as writer:
+    parents = [other.identity for other in others]
+    with next_version(first, "episodes", parents=parents, task=" / ".join(tasks), **described) as writer:
         for source, named in zip(sources, names, strict=True):
             for episode in source.episodes():
                 metadata = renamed_metadata(episode.uid, episode.metadata, named)

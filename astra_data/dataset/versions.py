@@ -160,18 +160,15 @@ def next_version(
     schema: Sequence[Column] | None = None,
     fps: int | None = None,
     subset_seed: int | None = None,
-    others: Iterable[Dataset] = (),
     task: str | None = None,
     **described: Any,
 ) -> DatasetWriter:
     """Prepare to write the version that follows `source`; its folder is the writer's `root`.
 
     Columns (or those of `schema`), of which there may be `more`, `cameras` unless False, `fps`, task, the seed of the
-    subsets and the description are carried over. `others` are further parents; `described` is what `successor`
-    takes: `stage`, `config`, `name`, ...
+    subsets and the description are carried over; `described` is what `successor` takes: `stage`, `config`, `name`, ...
     """
-    parents = [other.identity for other in others]
-    description, folder = successor(source.description, change, parents=parents, **described)
+    description, folder = successor(source.description, change, **described)
     return DatasetWriter(
         folder,
         [*(source.schema if schema is None else schema), *more],

@@ -95,14 +95,10 @@ class MujocoModel(FreeStates):
         self.model = copy.deepcopy(model)
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self.substeps = substeps
+        self.parameters = {"timestep_s": substeps * float(model.opt.timestep), "substeps": substeps}
         self._steps = ColdSteps(self.model, num_envs, num_threads)
         initial = np.concatenate([model.qpos0, np.zeros(model.nv)])
         super().__init__(torch.from_numpy(np.tile(initial, (num_envs, 1))).float())
-
-    @property
-    def parameters(self) -> dict[str, float]:
-        """What a dataset paired with this simulator records about it."""
-        return {"timestep_s": self.substeps * float(self.model.opt.timestep), "substeps": self.substeps}
 
     def step(self, action: Tensor) -> Tensor:
         """Apply controls `action` (B, nu), clipped by the motors; return the new state (B, nq + nv)."""

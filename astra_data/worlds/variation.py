@@ -1,28 +1,18 @@
 """Variation: how the parameters of simulators differ from episode to episode."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated
 
 from pydantic import AfterValidator
 
-from astra_data.core.config import Config, in_order
+from astra_data.core.config import Config, NotNegative, Positive, in_order
 from astra_data.core.lazy import Tensor, torch
 from astra_data.worlds.protocols import TaskSimulator
 
-
-def _range(where: str, fits: Callable[[float], bool]) -> AfterValidator:
-    def check(ends: tuple[float, float]) -> tuple[float, float]:
-        if not fits(ends[0]):
-            raise ValueError(f"expected a range {where}, got {list(ends)}")
-        return ends
-
-    return AfterValidator(check)
-
-
 Range = Annotated[tuple[float, float], AfterValidator(in_order)]
-FactorRange = Annotated[Range, _range("above 0", lambda least: least > 0)]
-NoiseRange = Annotated[Range, _range("from 0 up", lambda least: least >= 0)]
+FactorRange = Annotated[tuple[Positive, Positive], AfterValidator(in_order)]
+NoiseRange = Annotated[tuple[NotNegative, NotNegative], AfterValidator(in_order)]
 
 
 class Variation(Config):

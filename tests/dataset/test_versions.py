@@ -73,7 +73,7 @@ def test_the_next_version_has_the_columns_of_its_source_and_more(tmp_path: Path)
     labels: dict[str, Any] = {"stage": "label", "config": {}, "simulator": {"id": "one"}}
     more = [Column("phase")]
     with next_version(
-        source, "columns", more=more, subset_seed=3, others=[other], out=tmp_path / "next", **labels
+        source, "columns", more=more, subset_seed=3, parents=[other.identity], out=tmp_path / "next", **labels
     ) as writer:
         for episode in source.episodes():
             phase = np.zeros(len(episode), np.float32)

@@ -45,15 +45,18 @@ def test_noise_carries_no_command_beyond_one() -> None:
     assert noisy.max() == 1.0 and noisy.min() == -1.0 and float(noisy[:, 2].std()) == pytest.approx(0.1, rel=0.1)
 
 
+NOT_NEGATIVE = "greater than or equal to 0"
+
+
 @pytest.mark.parametrize("model", [PlanarVariation, BallVariation])
 @pytest.mark.parametrize(
     ("name", "least", "expected"),
     [
-        *(("friction", 0.0, "a range above 0"), ("timestep_scale", -0.5, "a range above 0")),
-        *((name, -0.1, "a range from 0 up") for name in ("action_noise", "position_noise_m", "velocity_noise_m_s")),
+        *(("friction", 0.0, "greater than 0"), ("timestep_scale", -0.5, "greater than 0")),
+        *((name, -0.1, NOT_NEGATIVE) for name in ("action_noise", "position_noise_m", "velocity_noise_m_s")),
     ],
 )
 def test_ranges_that_cannot_be_are_refused(model: type[Config], name: str, least: float, expected: str) -> None:
     with pytest.raises(RecipeError) as caught:
         validated({"row": {name: [least, 1.0]}}, create_model("Rows", row=(model, ...)), "r.toml")
-    assert str(caught.value) == f"r.toml: row.{name}: expected {expected}, got {[least, 1.0]}"
+    assert str(caught.value) == f"r.toml: row.{name}.0: expected {expected}, got {least}"

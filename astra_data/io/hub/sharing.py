@@ -58,7 +58,7 @@ def push(
     if isinstance(place, stores.UrlStore):
         if private:
             raise BadInputError(f"{place}: private is for the Hugging Face Hub; elsewhere, set permissions there.")
-        place = place.below(local.description["name"])
+        place = stores.UrlStore(f"{place}/{local.description['name']}")
     if faults := check(local.root).faults:
         raise CorruptDatasetError(f"{local.root} was altered: {'; '.join(faults)}. Restore it from a copy.")
     version = Version.parse(local.description["version"])

@@ -277,10 +277,6 @@ class UrlStore:
     def __str__(self) -> str:
         return self.url
 
-    def below(self, name: str) -> "UrlStore":
-        """Return the folder `name` in this one."""
-        return UrlStore(f"{self.url}/{name}")
-
     def versions(self) -> list[Version]:
         """Return the complete versions, the oldest first."""
         with explained(self.url):

@@ -43,6 +43,7 @@ def sole_clearance(pose: Tensor) -> Tensor:
     return height - humanoid.FOOT_RADIUS_M
 
 
+_PARAMETERS = {"timestep_s": humanoid.TIMESTEP_S, **humanoid.COMMAND_PARAMETERS}  # as paired datasets record them
 _POSE, _MOTION, _CONTACTS = slice(0, 6), slice(0, 13), slice(13, 15)
 _HEADED, _OF_JOINTS, _OF_BODY = (("heading", "invariant"), ("joint", "invariant"), ("body", "invariant"))
 
@@ -67,15 +68,11 @@ class HumanoidWalker2d(FreeStates):
     def __init__(self, num_envs: int, *, num_threads: int | None = None, device: str = "cpu") -> None:
         standing = humanoid.humanoid_to_walker2d(torch.tensor(humanoid.STANDING))
         super().__init__(standing.repeat(num_envs, 1).to(device))
+        self.parameters = _PARAMETERS
         self.memory = self._sunk(self.state)
         self._model = walker_model()
         self._models = [self._model]
         self._steps = ColdSteps(self._model, num_envs, num_threads)
-
-    @property
-    def parameters(self) -> dict[str, float]:
-        """What a dataset paired with this simulator records about it."""
-        return {"timestep_s": humanoid.TIMESTEP_S, **humanoid.COMMAND_PARAMETERS}
 
     def vary(self, parameters: Mapping[str, Tensor]) -> None:
         """Use factors (B, 1) on the joints' damping and on the control step, of as many physics steps, from now on."""
@@ -136,14 +133,10 @@ class HumanoidKinematics(FreeStates):
     def __init__(self, num_envs: int, *, device: str = "cpu") -> None:
         standing = type(self).abstraction(torch.tensor(humanoid.STANDING))
         super().__init__(standing.repeat(num_envs, 1).to(device))
+        self.parameters = _PARAMETERS
         self._damping = torch.from_numpy(humanoid.humanoid_model().dof_damping[-_COUNT:]).float().to(device)
         self._approach = humanoid.STIFFNESS / (humanoid.DAMPING + self._damping)
         self._timestep_s = torch.tensor(humanoid.TIMESTEP_S, device=device)
-
-    @property
-    def parameters(self) -> dict[str, float]:
-        """What a dataset paired with this simulator records about it."""
-        return {"timestep_s": humanoid.TIMESTEP_S, **humanoid.COMMAND_PARAMETERS}
 
     def vary(self, parameters: Mapping[str, Tensor]) -> None:
         """Use factors (B, 1) on the joints' damping and on the control step from the next step on."""
@@ -182,12 +175,7 @@ class HumanoidExtendedKinematics(HumanoidKinematics):
     def __init__(self, num_envs: int, *, follow_s: float = 0.3, device: str = "cpu") -> None:
         """Build B standing humanoids; `follow_s` is the time constant of the body's velocity and angular velocity."""
         super().__init__(num_envs, device=device)
-        self.follow_s = follow_s
-
-    @property
-    def parameters(self) -> dict[str, float]:
-        """What a dataset paired with this simulator records about it."""
-        return {**super().parameters, "follow_s": self.follow_s}
+        self.parameters = {**self.parameters, "follow_s": follow_s}
 
     def _moved(self, action: Tensor) -> Tensor:
         """Return joints, center of mass and its velocity, lean and spin (B, 46) after the step."""
@@ -198,7 +186,7 @@ class HumanoidExtendedKinematics(HumanoidKinematics):
         stance = feet[..., 2].argmin(dim=-1)
         rows = torch.arange(len(feet), device=feet.device)
         driven = ((later_mass - later_feet[rows, stance]) - (mass - feet[rows, stance])) / self._timestep_s
-        share = -torch.expm1(-self._timestep_s / self.follow_s)
+        share = -torch.expm1(-self._timestep_s / self.parameters["follow_s"])
         velocity = torch.lerp(self.state[:, _VELOCITY], driven, share)
         shift = torch.cat([aside[:, :2], velocity[:, 2:] * self._timestep_s], dim=-1)
         spin = (1.0 - share) * self.state[:, _SPIN]
