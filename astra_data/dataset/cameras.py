@@ -136,27 +136,24 @@ def read_cameras(root: Path, info: Mapping[str, Any]) -> tuple[dict[str, Camera]
     return {name: camera for name, camera in cameras.items() if name not in faults}, faults
 
 
-def _rows(root: Path, names: Sequence[str], camera: str) -> Iterator[dict[str, Any]]:
+def _rows(root: Path, names: Sequence[str], camera: str) -> Iterator[tuple[list[Any], dict[str, Any]]]:
     """Yield the values `names` of each episode, and its statistics of a camera."""
-    columns = [*names, *(f"stats/{camera}/{key}" for key in layout.STORED_STATISTICS)]
-    yield from (row for block in read_blocks(episodes_files(root), columns) for row in block.to_pylist())
-
-
-def _statistics(row: Mapping[str, Any], camera: str) -> dict[str, Any]:
-    names = {key: f"stats/{camera}/{key}" for key in layout.STORED_STATISTICS}
-    return {key: row[name] for key, name in names.items() if row.get(name) is not None}
+    stored = {f"stats/{camera}/{key}": key for key in layout.STORED_STATISTICS}
+    for row in (row for block in read_blocks(episodes_files(root), [*names, *stored]) for row in block.to_pylist()):
+        known = {key: row[name] for name, key in stored.items() if row.get(name) is not None}
+        yield [row[name] for name in names], known
 
 
 def _of_video(root: Path, info: Mapping[str, Any], name: str) -> Iterator[Clip]:
     pattern = str(info["video_path"]).replace("{video_key}", name)
     if not is_data_path(pattern):
         raise ValueError(f"expected a video_path inside the folder, got {info['video_path']!r}")
-    for row in _rows(root, ["length", *(f"videos/{name}/{key}" for key in layout.VIDEO_PLACE)], name):
-        chunk, file, from_s, to_s = (row[f"videos/{name}/{key}"] for key in layout.VIDEO_PLACE)
-        if abs((to_s - from_s) * info["fps"] - row["length"]) > 1:
-            raise ValueError(f"{to_s - from_s:.3f} s for {row['length']} frames")
+    known = ["length", *(f"videos/{name}/{key}" for key in layout.VIDEO_PLACE)]
+    for (length, chunk, file, from_s, to_s), statistics in _rows(root, known, name):
+        if abs((to_s - from_s) * info["fps"] - length) > 1:
+            raise ValueError(f"{to_s - from_s:.3f} s for {length} frames")
         path = root / pattern.format(chunk_index=chunk, file_index=file)
-        yield Clip(path, name, from_s, 1 / info["fps"], row["length"], None, _statistics(row, name))
+        yield Clip(path, name, from_s, 1 / info["fps"], length, None, statistics)
 
 
 def _of_images(root: Path, info: Mapping[str, Any], name: str) -> Iterator[Clip]:
@@ -164,10 +161,9 @@ def _of_images(root: Path, info: Mapping[str, Any], name: str) -> Iterator[Clip]
     firsts: dict[Path, int] = {}
     if not is_data_path(info["data_path"]):
         raise ValueError(f"expected a data_path inside the folder, got {info['data_path']!r}")
-    for row in _rows(root, known, name):
-        length, first, chunk, file = (row[key] for key in known)
+    for (length, first, chunk, file), statistics in _rows(root, known, name):
         path = root / info["data_path"].format(chunk_index=chunk, file_index=file)
-        yield Clip(path, name, first - firsts.setdefault(path, first), 1, length, None, _statistics(row, name))
+        yield Clip(path, name, first - firsts.setdefault(path, first), 1, length, None, statistics)
 
 
 def _of_format_2(root: Path, info: Mapping[str, Any], name: str) -> Iterator[Clip]:

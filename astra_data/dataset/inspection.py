@@ -84,12 +84,9 @@ def inspect_dataset(dataset: Dataset) -> Inspection:
     for column in dataset.schema:
         low, high, mean = (np.array(ranges[column.name][key], np.float64) for key in ("min", "max", "mean"))
         spreads.append(Spread(column, low, high, mean, np.zeros((column.size, BINS), np.int64)))
-    positions, velocities = (_empty_map(dataset, role) for role in ("position", "vector"))
     for block in dataset.blocks([column.name for column in dataset.schema]):
         for spread in spreads:
             _count(spread, block[spread.column.name])
-        for planar, group in filter(None, (positions, velocities)):
-            _visit(planar, block[STATE][:, group])
     return Inspection(
         reference=dataset.reference,
         fps=int(dataset.info["fps"]),
@@ -98,29 +95,13 @@ def inspect_dataset(dataset: Dataset) -> Inspection:
         success=None if successes is None else sum(value is True for value in successes),
         endings=endings_of(dataset) if TERMINATED in dataset.features else None,
         spreads=tuple(spreads),
-        positions=positions and positions[0],
-        velocities=velocities and velocities[0],
+        positions=visited(dataset),
+        velocities=visited(dataset, "vector"),
     )
 
 
 def visited(dataset: Dataset, role: str = "position") -> Map | None:
-    """Map the robot's positions, or another planar `role` of its state; None if the state has none."""
-    if found := _empty_map(dataset, role):
-        planar, group = found
-        for block in dataset.blocks([STATE]):
-            _visit(planar, block[STATE][:, group])
-    return found and found[0]
-
-
-def _count(spread: Spread, values: Array) -> None:
-    span = np.where(spread.high > spread.low, spread.high - spread.low, 1.0)
-    bins = (as_rows(values).astype(np.float64) - spread.low) / span * BINS
-    flat = np.clip(bins, 0, BINS - 1).astype(np.int64) + BINS * np.arange(spread.column.size)
-    spread.counts[:] += np.bincount(flat.ravel(), minlength=spread.counts.size).reshape(spread.counts.shape)
-
-
-def _empty_map(dataset: Dataset, role: str) -> tuple[Map, slice] | None:
-    """Return an empty map for the first pair with `role` in the state, and the pair's indices."""
+    """Map the robot's positions, or the first other planar pair of a `role` in its state; None if it has none."""
     roles = [pair for column in dataset.schema if column.name == STATE for pair in column.roles]
     group = next((group for found, group in roles if found == role), None)
     if group is None:
@@ -129,14 +110,19 @@ def _empty_map(dataset: Dataset, role: str) -> tuple[Map, slice] | None:
     low, high = (np.array(ranges[key], np.float64)[group] for key in ("min", "max"))
     cell = float((high - low).max()) / CELLS or 1.0
     width, height = (max(1, int(cells)) for cells in np.ceil((high - low) / cell - 1e-9))
-    return Map(np.zeros((height, width), dtype=np.int64), low, cell), group
+    counts = np.zeros((height, width), dtype=np.int64)
+    for block in dataset.blocks([STATE]):
+        cells = np.floor((block[STATE][:, group] - low) / cell + 1e-9)
+        x, y = cells.clip(0, [width - 1, height - 1]).astype(np.int64).T
+        np.add.at(counts, (y, x), 1)
+    return Map(counts, low, cell)
 
 
-def _visit(planar: Map, points: Array) -> None:
-    height, width = planar.counts.shape
-    cells = np.floor((points - planar.origin) / planar.cell + 1e-9)
-    x, y = cells.clip(0, [width - 1, height - 1]).astype(np.int64).T
-    np.add.at(planar.counts, (y, x), 1)
+def _count(spread: Spread, values: Array) -> None:
+    span = np.where(spread.high > spread.low, spread.high - spread.low, 1.0)
+    bins = (as_rows(values).astype(np.float64) - spread.low) / span * BINS
+    flat = np.clip(bins, 0, BINS - 1).astype(np.int64) + BINS * np.arange(spread.column.size)
+    spread.counts[:] += np.bincount(flat.ravel(), minlength=spread.counts.size).reshape(spread.counts.shape)
 
 
 def endings_of(dataset: Dataset) -> Endings:

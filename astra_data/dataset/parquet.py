@@ -29,12 +29,6 @@ def to_arrow(values: Array) -> pa.Array:
     return pa.Array.from_buffers(pa.from_numpy_dtype(values.dtype), len(values), [None, pa.py_buffer(data)])
 
 
-def to_lists(values: Array) -> pa.ListArray:
-    """Return the rows of `values` (n, size) as n lists."""
-    offsets = np.arange(len(values) + 1, dtype=np.int32) * np.int32(values.shape[1])
-    return pa.ListArray.from_arrays(to_arrow(offsets), to_arrow(values.reshape(-1)))
-
-
 def to_numpy(column: pa.ChunkedArray, size: int, dtype: str) -> Array:
     """Copy an Arrow column of n rows to a contiguous array (n,), or (n, size) if `size` > 1."""
     parts = [chunk.flatten() if size > 1 else chunk for chunk in column.chunks]

@@ -16,7 +16,7 @@ from astra_data.dataset.format import (
     STORED_STATISTICS,
     episodes_schema,
 )
-from astra_data.dataset.parquet import RotatingWriter, to_arrow, to_lists
+from astra_data.dataset.parquet import RotatingWriter, to_arrow
 from astra_data.dataset.plain import PlainColumn
 
 ROWS_AT_ONCE = 1000  # rows held in memory before they are written
@@ -136,12 +136,12 @@ class EpisodeRows:
                 stacked[:, :, part] = stacked[:, :, part].astype(np.float32)
             for name in STORED_STATISTICS:
                 values = lengths[:, None] if name == "count" else stacked[:, STATISTICS.index(name), part]
-                arrays.append(to_lists(values))
+                arrays.append(to_arrow(values))
         for field in self._schema.names[len(arrays) : -2]:
             known = (one.get(field) for one in self.pictures[self._episodes : self._episodes + count])
             arrays.append(pa.array(known, self._schema.field(field).type))
         arrays += [to_arrow(np.full(count, chunk)), to_arrow(np.full(count, file))]
-        self._writer.write(pa.Table.from_arrays(arrays, schema=self._schema))
+        self._writer.write(pa.Table.from_arrays(arrays, self._schema.names).cast(self._schema))
         self._episodes += count
         self._frames = int(ends[-1])
         self._rows.clear()

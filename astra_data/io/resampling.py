@@ -13,7 +13,6 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from astra_data.core.arrays import Ints
 from astra_data.core.errors import BadInputError
@@ -33,16 +32,9 @@ _AVERAGED = 20  # messages of a topic over which jitter is averaged; over many m
 class Resampler:
     """Holds the last messages of all topics and samples rows from them."""
 
-    def __init__(
-        self,
-        mapping: ImportMapping,
-        origin: str,
-        moments: Mapping[str, ArrayLike],
-        topic_of: Mapping[str, str] | None = None,
-    ) -> None:
-        """Sample the fields of `mapping` from the file `origin`; `topic_of` gives topics where names do not."""
+    def __init__(self, mapping: ImportMapping, origin: str, moments: Mapping[str, Ints], of: Mapping[str, str]) -> None:
+        """Sample the fields of `mapping` from the file `origin`; `moments` are of topics, `of` names each field's."""
         self._origin, self._fps = origin, mapping.fps
-        of = topic_of or {field: field.partition(":")[0] for field in mapping.all_fields}
         self.topics: dict[str, list[str]] = {}
         for field in mapping.all_fields:
             self.topics.setdefault(of[field], []).append(field)
@@ -60,7 +52,7 @@ class Resampler:
                 self._gap_ns[topic] = min(gap_ns, self._gap_ns.get(topic, gap_ns))
                 self._has_own_gap |= {topic} if column.gap_s else set()
         self._expiring = set(self._gap_ns)
-        self._moments = {topic: np.asarray(each, np.int64) for topic, each in moments.items()}
+        self._moments = moments
         self._refuse_apart()
         self._periods = usual_periods(self._moments, round((mapping.split.gap_s or 0) * 1e9))
         self._held: dict[str, Any] = {}

@@ -8,7 +8,7 @@ import pytest
 from astra_data.core.errors import CorruptDatasetError
 from astra_data.dataset import parquet
 from astra_data.dataset.columns import Array
-from astra_data.dataset.parquet import RotatingWriter, read_blocks, to_arrow, to_lists, to_numpy
+from astra_data.dataset.parquet import RotatingWriter, read_blocks, to_arrow, to_numpy
 
 
 @pytest.mark.parametrize(
@@ -29,11 +29,6 @@ def test_values_go_to_arrow_and_back(values: Array, kind: pa.DataType) -> None:
     back = to_numpy(chunks, size, values.dtype.name)
     assert back.dtype == values.dtype and back.flags.c_contiguous
     np.testing.assert_array_equal(back, values)
-
-
-def test_rows_become_lists() -> None:
-    values = np.arange(6.0).reshape(2, 3)
-    assert to_lists(values).to_pylist() == values.tolist() and to_lists(values.T).to_pylist() == values.T.tolist()
 
 
 @pytest.mark.parametrize(

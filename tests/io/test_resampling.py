@@ -37,7 +37,8 @@ def sampled(
         }
     )
     times = {"/odom": odom, "/cmd": commands}
-    resampler = Resampler(mapping, "log", {topic: t * MS for topic, t in times.items()})
+    of = {field: field.partition(":")[0] for field in mapping.all_fields}
+    resampler = Resampler(mapping, "log", {topic: (t * MS).astype(np.int64) for topic, t in times.items()}, of)
     messages = sorted((t, topic, k) for topic, series in times.items() for k, t in enumerate(series))
     rows = [row for _, row in resampler.rows((topic, round(t * MS), k) for t, topic, k in messages)]
     return resampler, [(row["/odom"], row["/cmd"]) for row in rows]

@@ -57,6 +57,7 @@ def whole_runs(
     episode = row = 0
     uids: set[int] = set()
     for run, is_cut in _every_run(folder, columns, notes):
+        rows = f"rows {run.row} to {run.row + len(run) - 1} of {_name(run.path)}"
         # As most rows tell: the episode, its first row in the dataset and its first frame.
         steps, found = np.arange(len(run)), run.columns
         claimed = found[names.EPISODE_INDEX], found[names.INDEX] - steps, found[names.FRAME_INDEX] - steps
@@ -64,14 +65,12 @@ def whole_runs(
         place = places.get(number)
         if frame > 0 or (is_cut and (place is None or place.length != len(run))):
             if is_cut:
-                rows = f"rows {run.row} to {run.row + len(run) - 1} of {_name(run.path)}"
                 notes.append(f"left out {rows}: they may be part of an episode")
             continue  # a part of an episode whose other rows are lost
         is_known = place is not None and place.length == len(run) and place.first_row in (None, first)
         if place is None and number < most:
             is_known = (number > episode and first > row) or (number < episode and first < row)
         if is_known and number < episode:
-            rows = f"rows {run.row} to {run.row + len(run) - 1} of {_name(run.path)}"
             notes.append(f"left out {rows}: they are of episode {number} once more")
             continue
         if is_known and number > episode:

@@ -14,8 +14,6 @@ from astra_data.io.recording import VALUE_BYTES, Block, Source, row_count
 
 SUFFIXES = (".parquet",)
 
-_ONE_LENGTH = "expected lists of one length, without missing ones"
-
 
 def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     """Yield the rows of the fields; missing numbers are NaN, and times whole numbers of their own unit."""
@@ -48,7 +46,7 @@ def _array(column: pa.Array, origin: str) -> Array:
         is_fixed = pa.types.is_fixed_size_list(kind)
         sizes = {kind.list_size} if is_fixed else set(column.value_lengths().to_pylist())
         if column.null_count or len(sizes) > 1:
-            raise BadInputError(f"{origin}: {_ONE_LENGTH}")
+            raise BadInputError(f"{origin}: expected lists of one length, without missing ones")
         size = sizes.pop()
         values = _array(flat, origin) if len(flat) else np.empty(0)
         return values.reshape(len(column), size, *values.shape[1:])
