@@ -3,7 +3,7 @@
 import hashlib
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +21,12 @@ class RobotPolicy:
         """Take the rate at which it will act, and the names of the values that it will be given."""
         described, graph = intact(folder, "policy.json", "policy.onnx")
         self.about: dict[str, Any] = json.loads(described)
-        if not abs(rate_hz / self.about["rate_hz"] - 1.0) <= 0.01:  # nor NaN
-            raise ValueError(f"rate_hz: expected {self.about['rate_hz']:g}, got {rate_hz:g}")
+        if not abs(finite("rate_hz", [rate_hz], ["rate_hz"])[0] / self.about["rate_hz"] - 1.0) <= 0.01:
+            raise ValueError(f"rate_hz: expected {self.about['rate_hz']:g}, got {rate_hz}")
         for column, names in (("state", state), ("goal", goal)):
-            if list(names) != (expected := self.about[column]["names"]):
-                raise ValueError(f"{column}: expected the values {expected}, got {list(names)}")
+            given = list(names) if isinstance(names, Iterable) else names
+            if given != (expected := self.about[column]["names"]):
+                raise ValueError(f"{column}: expected the values {expected}, got {given}")
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = 1
         self.session = onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])

@@ -189,12 +189,12 @@ class WatchedEnv(BatchedVectorEnv):
         self.points: list[dict[str, Any]] = []
         self._simulated, self._total, self._progress = env, training.config.total_steps, training.progress
         self._is_lasting = training.task.objective.is_lasting
-        self._ramps = training.is_plus and not self._is_lasting
+        self._ramps, self._mastered = training.is_plus and not self._is_lasting, training.config.least_success
         self._steps = self._ended = self._succeeded = self._lasted = 0
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
         """Apply actions (B, A) for one control step."""
-        self._simulated.penalty_scale = penalty_scale(self.points) if self._ramps else 1.0
+        self._simulated.penalty_scale = penalty_scale(self.points, self._mastered) if self._ramps else 1.0
         ages = self._age.numpy() + 1
         stepped = super().step(actions)
         infos = stepped[-1]

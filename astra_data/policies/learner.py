@@ -158,7 +158,6 @@ class Learner(ABC):
 Points = Sequence[Mapping[str, float | None]]
 
 _RECENT = 5  # points of the learning curve over which success is averaged
-MASTERED = 0.8  # success at which a simulator is mastered
 _NEARLY_ALWAYS = 0.95  # success of training episodes from which on little is left to learn
 _FAST = 6.0  # pace of a training then
 _GROWTH_SHARE = 0.25  # share of the training over which penalties grow; from the start, they teach robots to stand
@@ -176,13 +175,16 @@ def pace(points: Points, penalties: float) -> float:
     return _FAST if penalties == 1.0 and recent_success(points) >= _NEARLY_ALWAYS else 1.0
 
 
-def penalty_scale(points: Points) -> float:
-    """Return the factor on penalties (0 to 1) after `points`: grows while episodes succeed, else falls."""
+def penalty_scale(points: Points, mastered: float) -> float:
+    """Return the factor on penalties (0 to 1) after `points`: grows while episodes succeed, else falls.
+
+    In the end a success of `mastered` is enough.
+    """
     scale, before = 0.0, 0.0
     for number, point in enumerate(points, 1):
         now = float(point["share"] or 0.0)
         change = (now - before) / _GROWTH_SHARE
-        needed = _NEARLY_ALWAYS if now < _PATIENCE_SHARE else MASTERED
+        needed = _NEARLY_ALWAYS if now < _PATIENCE_SHARE else mastered
         scale += change if recent_success(points[max(0, number - _RECENT) : number]) >= needed else -change
         scale, before = min(1.0, max(0.0, scale)), now
     return scale

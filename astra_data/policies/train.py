@@ -21,7 +21,7 @@ from astra_data.grounding.files import grounding_at
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.simulator import Grounding
 from astra_data.policies.episodes import ObservedTargetEnv, Reached, reached_in_own_world
-from astra_data.policies.learner import MASTERED, Learner, SavedPolicy, lately, pace, penalty_scale
+from astra_data.policies.learner import Learner, SavedPolicy, lately, pace, penalty_scale
 from astra_data.policies.ppo import Ppo, PpoConfig
 from astra_data.policies.running_policy import POLICY, Observed, PolicyFile
 from astra_data.policies.sac import Sac, SacConfig
@@ -59,7 +59,7 @@ class TrainConfig(Config):
     tries: AtOnce = 2
     """Maximum number of training runs. A policy that does not master its own simulator (in 100 episodes from
     the task's starts, acting by the mean of its actions) is trained again with another seed, twice as long."""
-    least_success: Share = MASTERED
+    least_success: Share = 0.8
     """Success in these episodes at which a simulator is mastered; if no try reaches it, the best one is kept."""
 
 
@@ -182,7 +182,7 @@ def optimize(learner: Learner, env: TrainingEnv, training: Training, checkpoint:
     is_lasting = training.task.objective.is_lasting
     ramps = training.is_plus and isinstance(learner, Ppo) and not is_lasting
     while not learner.done:
-        env.penalty_scale = penalty_scale(points) if ramps else 1.0
+        env.penalty_scale = penalty_scale(points, training.config.least_success) if ramps else 1.0
         learner.pace = pace(points, env.penalty_scale)
         metrics = learner.iterate()
         # JSON has no NaN: undefined figures, such as the success rate of no episodes, are null.

@@ -88,9 +88,11 @@ def test_ranges_that_are_not_known_or_have_no_width_refuse_nothing() -> None:
 @pytest.mark.parametrize(
     ("wrong", "told"),
     [
-        ({"rate_hz": 20}, "rate_hz: expected 10, got 20"),
+        ({"rate_hz": "20"}, "rate_hz: expected 10, got 20"),
         ({"rate_hz": 9.8}, "rate_hz: expected 10, got 9.8"),
-        ({"rate_hz": float("nan")}, "rate_hz: expected 10, got nan"),
+        ({"rate_hz": float("nan")}, "rate_hz: expected 1 finite value"),
+        ({"rate_hz": None}, "rate_hz: expected 1 finite value"),
+        ({"state": None}, r"state: expected the values \['x', 'speed'\], got None"),
         ({"state": ["speed", "x"]}, r"state: expected the values \['x', 'speed'\], got \['speed', 'x'\]"),
         ({"goal": []}, r"goal: expected the values \['goal_0'\], got \[\]"),
     ],

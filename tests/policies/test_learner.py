@@ -173,10 +173,11 @@ def test_success_is_the_mean_of_the_last_five_points(successes: list[float | Non
 def test_penalties_grow_over_a_quarter_while_episodes_succeed_and_shrink_as_fast(
     successes: list[float | None], scale: float
 ) -> None:
-    assert penalty_scale(curve(*successes)) == pytest.approx(scale)
+    assert penalty_scale(curve(*successes), 0.8) == pytest.approx(scale)
 
 
 def test_at_a_faster_pace_they_grow_with_the_share() -> None:
     points = [{"share": 0.1, "success": 1.0}, {"share": 0.225, "success": 1.0}]
-    assert penalty_scale(points) == pytest.approx(0.9)
+    assert penalty_scale(points, 0.8) == pytest.approx(0.9)
+    assert penalty_scale(curve(*[0.7] * 5), 0.7) == pytest.approx(0.8)
     assert lately(curve(0.0, *[1.0] * 10), "success") == "success of training episodes 1.00"

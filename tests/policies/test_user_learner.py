@@ -76,7 +76,7 @@ def test_its_curve_is_kept_for_it(tmp_path: Path, command: float, success: float
 @pytest.mark.parametrize(
     ("is_plus", "task", "command", "expected"),
     [
-        (True, TASK, 1.0, [0.0] * 10 + [0.4]),
+        (True, TASK, 1.0, [0.0] * 10 + [1.0]),
         (True, TASK, -1.0, [0.0] * 11),
         (False, TASK, 1.0, [1.0] * 11),
         (True, replace(TASK, objective=Last(horizon=40)), 1.0, [1.0] * 11),
@@ -86,12 +86,13 @@ def test_prices_grow_as_in_other_trainings(
     tmp_path: Path, is_plus: bool, task: Task, command: float, expected: list[float]
 ) -> None:
     given, scales = replace(training(tmp_path), is_plus=is_plus, task=task), list[float]()
+    given = replace(given, config=given.config.model_copy(update={"least_success": 0.5}))
 
     def learn(env: WatchedEnv, training: Training) -> Constant:
         env.reset()
         for _ in range(11):
-            # After a tenth of the training, over a quarter of which prices grow.
-            env.points[:] = [] if len(scales) < 10 else [{"share": 0.1, "success": max(0.0, command)}]
+            # In the end the success that the recipe asks for is enough.
+            env.points[:] = [] if len(scales) < 10 else [{"share": 0.45, "success": max(0.0, command) / 2}]
             env.step(np.full((4, 1), command))
             scales.append(env.env.env.penalty_scale)  # type: ignore[union-attr]
         return Constant(command)
