@@ -8,7 +8,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from astra_data.dataset.description import sealed
-from astra_data.dataset.format import DATASET_PATH
+from astra_data.dataset.format import DATASET_PATH, INFO_PATH
 
 DATA = "data/chunk-000/file-000.parquet"
 EPISODES = "meta/episodes/chunk-000/file-000.parquet"
@@ -51,6 +51,16 @@ def reseal(root: Path) -> None:
 def edit(name: str, /, **changes: object) -> Callable[[Path], object]:
     """Change keys of a JSON file."""
     return lambda root: (root / name).write_text(json.dumps(json.loads((root / name).read_text()) | changes))
+
+
+def declare(column: str, **changes: object) -> Callable[[Path], object]:
+    """Change how meta/info.json describes a column, or describe one that is not there."""
+
+    def damage(root: Path) -> None:
+        features = json.loads((root / INFO_PATH).read_text())["features"]
+        edit(INFO_PATH, features=features | {column: features.get(column, {}) | changes})(root)
+
+    return damage
 
 
 def drop(name: str) -> Callable[[Path], None]:

@@ -37,6 +37,7 @@ DESCRIPTION: Mapping[str, Any] = {
     "seeds": {"collect": 0},
     "environment": {"id": "Fake-v0"},
 }
+SETTINGS: Mapping[str, Any] = {"columns": COLUMNS, "fps": 20, "task": "run", "description": DESCRIPTION}
 LENGTHS = (7, 1, 12, 30, 5)
 
 
@@ -70,8 +71,7 @@ def fake_episodes() -> list[keys.Episode]:
 
 
 def writer(root: Path, **changes: Any) -> DatasetWriter:
-    settings: dict[str, Any] = {"columns": COLUMNS, "fps": 20, "task": "run", "description": DESCRIPTION}
-    return DatasetWriter(root, **settings | changes)
+    return DatasetWriter(root, **{**SETTINGS, **changes})
 
 
 def write_fake(root: Path, **changes: Any) -> Dataset:
@@ -82,8 +82,7 @@ def write_fake(root: Path, **changes: Any) -> Dataset:
 
 
 def staged_writer(root: Path, **changes: Any) -> StagedWriter:
-    settings: dict[str, Any] = {"columns": COLUMNS, "fps": 20, "task": "run", "description": DESCRIPTION}
-    return StagedWriter(root, **settings | changes)
+    return StagedWriter(root, **{**SETTINGS, **changes})
 
 
 def assert_same(found: Iterable[keys.Episode], expected: Iterable[keys.Episode]) -> None:

@@ -75,13 +75,12 @@ def test_one_value_per_step_may_be_given_as_gymnasium_has_it() -> None:
     [
         ({}, "no columns"),
         ({keys.STATE: np.zeros((0, 2), np.float32)}, "no steps"),
-        ({keys.STATE: np.float32(1)}, "shape ()"),
+        ({keys.STATE: np.float32(1)}, r"shape \(\)"),
     ],
 )
 def test_an_empty_episode_is_refused(columns: dict[str, keys.Array], part: str) -> None:
-    with pytest.raises(BadInputError) as caught:
+    with pytest.raises(BadInputError, match=part):
         keys.Episode(0, columns)
-    assert part in str(caught.value)
 
 
 @pytest.mark.parametrize(

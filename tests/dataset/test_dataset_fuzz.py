@@ -9,11 +9,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
-from damaged import DATA, EPISODES
+from damaged import DATA, EPISODES, declare
 from fake_dataset import write_fake
 from fuzzing import Edit, broken, edits, fuzzed, shares
 from hypothesis import given
@@ -88,15 +87,6 @@ def pipe(name: str) -> Callable[[Path], None]:
     return damage
 
 
-def declare(column: str, **feature: Any) -> Callable[[Path], object]:
-    def damage(root: Path) -> object:
-        info = json.loads((root / INFO).read_text())
-        info["features"][column] = info["features"].get(column, {"dtype": "float32", "shape": [1]}) | feature
-        return (root / INFO).write_text(json.dumps(info))
-
-    return damage
-
-
 DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     **{f"{name} has a column twice": (double(name), "more than once|was altered") for name in PARQUET},
     "no rows in the data": (empty(DATA), "there are no steps"),
@@ -105,7 +95,7 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     "a pipe beside the data": (pipe("data/chunk-000/file-001.parquet"), "a device or a pipe"),
     "another pipe": (pipe("data/pipe"), "data/pipe does not belong to it"),
     "a shape of 2^30": (declare("action", shape=[2**30], names=None), "was altered"),
-    "a name of 300 letters": (declare("x" * 300), "lacks column xxx"),
+    "a name of 300 letters": (declare("x" * 300, dtype="float32", shape=[1]), "lacks column xxx"),
 }
 
 

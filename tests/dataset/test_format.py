@@ -59,11 +59,6 @@ def test_info_has_lerobots_fields(lerobot: SimpleNamespace, fake: Dataset) -> No
     assert info.to_dict() == fake.info and set(asdict(info)) - set(fake.info) == {"tools"}
 
 
-def test_the_tasks_table_is_a_pandas_frame_with_the_task_as_index() -> None:
-    frame = layout.tasks_table("walk").to_pandas()
-    assert (frame.index.name, frame.index.tolist()) == ("task", ["walk"]) and frame["task_index"].tolist() == [0]
-
-
 @pytest.fixture(scope="module")
 def reference(lerobot: SimpleNamespace, fake: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same values, written by lerobot itself."""

@@ -9,6 +9,7 @@ import datasets
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from damaged import DATA, alter
 from fake_dataset import COLUMNS, LENGTHS, assert_same, concatenated, fake_columns, fake_episodes, write_fake, writer
 
 from astra_data.core.errors import BadInputError, CorruptDatasetError
@@ -141,15 +142,9 @@ def test_a_folder_of_versions_is_no_dataset(tmp_path: Path) -> None:
 
 def test_verify_finds_altered_values(tmp_path: Path) -> None:
     dataset = write_fake(tmp_path / "set")
-    [path] = dataset.paths
-    table = pq.read_table(path)
-    frame = table.column_names.index("frame_index")
-    changed = table.column("frame_index").to_numpy().copy()
-    changed[9] = 7
-    pq.write_table(table.set_column(frame, table.schema.field(frame), [changed]), path)
+    alter(DATA, "frame_index", 9, 7)(dataset.root)
     [altered] = Dataset.open(dataset.root).verify()
-    where = "data/chunk-000/file-000.parquet rows 8 to 19 (episode 2)"
-    assert altered == f"frame_index: other values than were written in {where}"
+    assert altered == f"frame_index: other values than were written in {DATA} rows 8 to 19 (episode 2)"
 
 
 def test_the_content_hash_sees_values_only(tmp_path: Path) -> None:
@@ -200,10 +195,7 @@ def test_the_rows_are_those_of_lerobots_object(fake: Dataset, lerobot: SimpleNam
 @pytest.mark.usefixtures("lerobot")  # its cache, and no network
 def test_altered_values_are_not_handed_on(fake: Dataset, tmp_path: Path) -> None:
     root = shutil.copytree(fake.root, tmp_path / "altered")
-    path = root / "data/chunk-000/file-000.parquet"
-    table = pq.read_table(path)
-    moved = table.column(ACTION).combine_chunks().take([len(table) - 1, *range(len(table) - 1)])
-    pq.write_table(table.set_column(table.schema.get_field_index(ACTION), table.field(ACTION), moved), path)
+    alter(DATA, ACTION, 0, [9.0, 9.0])(root)
     altered = Dataset.open(root)
     for convert in (altered.to_huggingface, altered.to_lerobot):
         with pytest.raises(CorruptDatasetError):

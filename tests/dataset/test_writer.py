@@ -120,13 +120,6 @@ def test_a_kill_leaves_nothing_and_the_next_run_succeeds(tmp_path: Path, moment:
     assert list(tmp_path.iterdir()) == [root]
 
 
-def test_an_exception_leaves_nothing(tmp_path: Path) -> None:
-    with pytest.raises(KeyboardInterrupt), writer(tmp_path / "set") as open_writer:
-        open_writer.add(fake_episode(1, 5))
-        raise KeyboardInterrupt
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_two_writers_do_not_meet(tmp_path: Path) -> None:
     with writer(tmp_path / "set") as first:
         first.add(fake_episode(1, 5))

@@ -127,8 +127,6 @@ def test_values_are_called_as_their_fields_are_unless_the_mapping_says() -> None
 def test_whole_numbers_are_exact_to_their_bounds() -> None:
     values, finite = convert({"dtype": "int64"}, np.array([200, 2**63 - 1], np.uint64))  # type: ignore[arg-type]
     assert (values.tolist(), finite) == ([200, 2**63 - 1], [True, True])
-    with pytest.raises(BadInputError, match=r"c: expected whole numbers below 2\^63"):
-        convert({"dtype": "int64"}, np.array([1, 2**63], np.uint64))  # type: ignore[arg-type]
     for number in (2.0**53, -(2.0**53)):  # which 2^53 + 1 is rounded to
         with pytest.raises(BadInputError, match=r"c: numbers of 2\^53 or more came as floats"):
             convert({"dtype": "int64"}, [0.0, number])

@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike
 
 from astra_data.dataset.columns import ACTION, DONE, NEXT_STATE, REWARD, STATE, SUCCESS, TERMINATED, TRUNCATED, Array
 from astra_data.dataset.inspection import Endings
-from astra_data.io.cutting import Cutter, column_of
-from astra_data.io.mapping import ColumnMapping, ImportMapping
+from astra_data.io.cutting import Cutter
+from astra_data.io.mapping import ImportMapping
 from astra_data.io.recording import Block
 
 
@@ -141,11 +141,6 @@ def timed(*files: Array, names: Sequence[str] = ()) -> Cutter:
     return cutting
 
 
-def fed(rates: Sequence[tuple[str, float]]) -> Cutter:
-    """Return a cutter that has read a file of 50 rows at each of these rates."""
-    return timed(*(np.arange(50) / rate for _, rate in rates), names=[name for name, _ in rates])
-
-
 def test_files_of_a_few_rows_tell_no_rate() -> None:
     cutting = timed(np.arange(20) / 5, np.arange(21) / 5, np.arange(1000) / 10)
     cutting.check()
@@ -153,8 +148,9 @@ def test_files_of_a_few_rows_tell_no_rate() -> None:
 
 
 def test_files_of_other_rates_among_many_are_named() -> None:
-    good = [(f"{number}.csv", rate) for number, rate in enumerate(np.linspace(9.2, 10.8, 30))]
-    cutting = fed([("fast.csv", 20.0), *good, ("slow.csv", 5.0)])
+    good = {f"{number}.csv": rate for number, rate in enumerate(np.linspace(9.2, 10.8, 30))}
+    rates = {"fast.csv": 20.0, **good, "slow.csv": 5.0}
+    cutting = timed(*(np.arange(50) / rate for rate in rates.values()), names=[*rates])
     cutting.check()
     assert cutting.tally.notes == ["fast.csv: 20 Hz, 10 Hz declared", "slow.csv: 5 Hz, 10 Hz declared"]
 
@@ -239,12 +235,6 @@ def test_rows_without_a_value_of_the_field_are_one_episode_as_empty_cells_are() 
     made = cutter(split={"field": "trial"})
     assert rows(cut(made, x=np.arange(7), trial=field)) == [[0], [2, 3], [5]]
     assert made.tally.split_points == {"field": 2}
-
-
-def test_fields_of_which_values_are_taken_name_none_of_them() -> None:
-    for take, names in (((), ["x", "a"]), ((1, 0), None)):
-        found = column_of(STATE, ColumnMapping(fields=("x", "a"), take=take), 2).names
-        assert (found and list(found)) == names
 
 
 def test_columns_may_have_any_names() -> None:

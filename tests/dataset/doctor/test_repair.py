@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from damaged import DATA, EPISODES, alter, alter_rows, drop, edit, reseal, write
+from damaged import DATA, EPISODES, alter, alter_rows, drop, edit, reseal, truncate, write
 from fake_dataset import COLUMNS, DESCRIPTION, LENGTHS, assert_same, fake_columns, fake_episodes, write_fake, writer
 
 from astra_data.core.errors import BadInputError, CorruptDatasetError
@@ -202,10 +202,8 @@ def test_an_episode_that_may_have_been_cut_is_left_out(tmp_path: Path) -> None:
     root = write_fake(tmp_path / "set").root
     table = pq.read_table(root / DATA)
     pq.write_table(table, root / DATA, row_group_size=20)
-    size = (root / DATA).stat().st_size
-    with (root / DATA).open("r+b") as file:
-        file.truncate(size - 5)
-    (root / EPISODES).unlink()
+    truncate(DATA)(root)
+    drop(EPISODES)(root)
     repaired = repair(root, out=tmp_path / "saved")
     assert repaired.episodes == 4
     assert f"left out rows 50 to 54 of {DATA}: they may be part of an episode" in repaired.notes
@@ -213,9 +211,7 @@ def test_an_episode_that_may_have_been_cut_is_left_out(tmp_path: Path) -> None:
 
 def test_metadata_is_joined_by_uid(tmp_path: Path) -> None:
     original = write_fake(tmp_path / "original", subset_seed=7)
-    edited = tmp_path / "edited"
-    shutil.copytree(original.root, edited)
-    shutil.rmtree(edited / "meta/astra")
+    edited = shutil.copytree(original.root, tmp_path / "edited", ignore=shutil.ignore_patterns("astra"))
     repair(edited, out=tmp_path / "alone")
     assert Dataset.open(tmp_path / "alone").metadata == Dataset.open(edited).metadata  # of LeRobot: with next states
     alone, before = (Dataset.open(at).columns([NEXT_STATE])[NEXT_STATE] for at in (tmp_path / "alone", edited))
@@ -329,14 +325,8 @@ def test_altered_metadata_is_not_taken_over(tmp_path: Path) -> None:
 
 def test_episodes_with_other_values_than_the_original_are_left_out(tmp_path: Path) -> None:
     original = write_fake(tmp_path / "original")
-    edited = tmp_path / "edited"
-    shutil.copytree(original.root, edited)
-    shutil.rmtree(edited / "meta/astra")
-    table = pq.read_table(edited / DATA)
-    rewards = table.column(REWARD).to_pylist()
-    rewards[0] += 1.0
-    at = table.column_names.index(REWARD)
-    pq.write_table(table.set_column(at, table.field(REWARD), pa.array(rewards, pa.float32())), edited / DATA)
+    edited = shutil.copytree(original.root, tmp_path / "edited", ignore=shutil.ignore_patterns("astra"))
+    alter_rows(edited / DATA, REWARD, {0: 9.0})
     uid, *others = original.uids.tolist()
     repaired = repair(edited, out=tmp_path / "joined", like=original)
     assert f"left out the episode of uid {uid}: its values are not those in {original.reference}" in repaired.notes

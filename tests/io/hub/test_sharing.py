@@ -13,6 +13,7 @@ from pathlib import Path
 
 import fsspec
 import pytest
+from damaged import DATA, edit
 from fake_dataset import DESCRIPTION, write_fake
 from fsspec.implementations.local import LocalFileSystem
 from shared_files import contents
@@ -25,7 +26,6 @@ from astra_data.io.hub.stores import RemoteFolder, UrlStore
 
 pytestmark = pytest.mark.usefixtures("quick_figure")
 
-DATA = "data/chunk-000/file-000.parquet"
 DESCRIBED = "meta/astra/dataset.json"
 
 
@@ -160,8 +160,7 @@ def test_a_listing_that_leads_out_of_the_folder_fetches_nothing(shared: Path, tm
 
 @pytest.mark.parametrize(("key", "value"), [("name", "../../away"), ("name", ".."), ("name", 3), ("version", "9.0.0")])
 def test_a_description_cannot_choose_its_place(key: str, value: object, shared: Path, home: Path) -> None:
-    description = json.loads((shared / "meta/astra/dataset.json").read_text()) | {key: value}
-    (shared / "meta/astra/dataset.json").write_text(json.dumps(description))
+    edit(DESCRIBED, **{key: value})(shared)
     resign(shared)
     with pytest.raises(SharingError, match="calls itself"):
         pull(source(shared))
@@ -182,8 +181,7 @@ def test_a_description_cannot_choose_its_place(key: str, value: object, shared: 
 def test_what_is_no_whole_dataset_is_refused(
     path: str, change: dict[str, object], shared: Path, tmp_path: Path
 ) -> None:
-    content = json.loads((shared / path).read_text()) | change
-    (shared / path).write_text(json.dumps(content))
+    edit(path, **change)(shared)
     resign(shared)
     with pytest.raises(SharingError, match="is not a complete dataset"):
         pull(source(shared), out=tmp_path / "new/place/out")
@@ -356,9 +354,7 @@ def test_notes_are_in_the_card_and_their_faults_are_told_before_anything_is_sent
 
 def test_altered_values_are_not_pushed(tmp_path: Path) -> None:
     dataset = write_fake(tmp_path / "mine")
-    description = json.loads((dataset.root / "meta/astra/dataset.json").read_text())
-    text = json.dumps(description | {"content_hash": "0" * 64})
-    (dataset.root / "meta/astra/dataset.json").write_text(text)
+    edit(DESCRIBED, content_hash="0" * 64)(dataset.root)
     with pytest.raises(CorruptDatasetError, match=r"dataset\.json was altered"):
         push(dataset.root, f"file://{tmp_path}/shared")
     assert not (tmp_path / "shared").exists()

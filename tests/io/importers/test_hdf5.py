@@ -4,7 +4,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from recordings import MAPPING, imported, rows
+from recordings import LOG, MAPPING, imported, rows
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED, Array
@@ -129,11 +129,7 @@ def test_transposed_files_are_those_of_matlab(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "walking.mat", "w") as file:
         file["estimator/joints"] = joints
         file["names"] = h5py.Empty("f8")
-    mapping = """
-name = "icub"
-task = "walk"
-fps = 100
-transposed = true
+    mapping = f"""{LOG}transposed = true
 [columns."observation.state"]
 fields = ["estimator/joints"]
 take = [4, 0]

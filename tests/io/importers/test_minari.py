@@ -5,7 +5,7 @@ import h5py
 import numpy as np
 import pytest
 from minari_recordings import LENGTHS, episodes, write_minari
-from recordings import imported
+from recordings import LOG, imported
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED, Array
@@ -36,11 +36,7 @@ def test_every_value_of_a_goal_dataset_arrives(tmp_path: Path, data_format: str)
 def test_a_mapping_chooses_other_fields(tmp_path: Path) -> None:
     made = episodes(is_dict=True)
     path = write_minari(tmp_path / "minari", made)
-    mapping = """
-name = "ant"
-task = "walk"
-fps = 10
-[columns."observation.state"]
+    mapping = f"""{LOG}[columns."observation.state"]
 fields = ["observations/achieved_goal"]
 """
     dataset, _ = imported(tmp_path, path, mapping)
@@ -58,11 +54,7 @@ def test_infos_that_begin_with_the_resets_are_those_before_a_step_or_after_it(tm
         infos = {"qpos": np.arange(length + 1.0), "cost": -np.arange(1.0 * length), "success": success}
         episode["infos"] = infos | {"speed": np.arange(length + 1.0), "unused": success}
     path = write_minari(tmp_path / "minari", made)
-    mapping = """
-name = "ant"
-task = "walk"
-fps = 10
-[columns."observation.state"]
+    mapping = f"""{LOG}[columns."observation.state"]
 fields = ["infos/qpos", "infos/cost"]
 [columns."next.observation.state"]
 fields = ["next_infos/qpos", "infos/cost"]

@@ -9,6 +9,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from fake_dataset import write_fake
+from recordings import LOG
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ACTION, STATE
@@ -86,11 +87,7 @@ def test_the_values_of_lists_count_and_those_of_other_columns_do_not(tmp_path: P
     assert len(next(parquet.read(Source(path, None, path, most_bytes=24_000), mapping)))
 
 
-FRAMES = """
-name = "again"
-task = "walk"
-fps = 20
-[columns."observation.state"]
+FRAMES = f"""{LOG}[columns."observation.state"]
 fields = ["observation.state"]
 [columns.action]
 fields = ["action"]
@@ -107,7 +104,7 @@ def test_a_dataset_comes_back_but_for_last_rows_without_a_next_state(tmp_path: P
     last = np.cumsum(fake.lengths) - 1
     for name, values in fake.columns([STATE, ACTION]).items():
         np.testing.assert_array_equal(again.columns([name])[name], np.delete(values, last, axis=0))
-    assert again.reference == "again@data-1.0.0"
+    assert again.reference == "log@data-1.0.0"
 
 
 def test_rows_that_do_not_fit_are_told(tmp_path: Path) -> None:
