@@ -11,39 +11,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from astra_data.core.errors import BadInputError, RecipeError
-from astra_data.core.naming import RECORD, RUNS, STAGE_NAMES
+from astra_data.core.errors import BadInputError
+from astra_data.core.naming import STAGE_NAMES
 
 if TYPE_CHECKING:
     from rich.table import Table
-
-
-def recipe_at(path: Path) -> Path:
-    """Refuse a path at which there is no recipe, and say where one of this name is."""
-    from astra_data.core.config import load_tables
-    from astra_data.pipeline.shipped import whereabouts
-
-    if path.is_dir():  # a run or a dataset, perhaps: what is read then says so
-        return path
-    try:
-        load_tables(path)
-    except RecipeError as error:
-        place = "" if path.exists() else whereabouts(path.name.removesuffix(".toml"))
-        raise RecipeError(f"{path} does not exist: {place}" if place else str(error)) from None
-    return path
-
-
-def run_at(folder: Path) -> Path:
-    """Refuse what is no folder of a run."""
-    from astra_data.core.config import did_you_mean
-
-    if not (folder / RECORD).is_file():
-        known = [str(record.parent) for record in sorted(RUNS.glob(f"*/{RECORD}"))]
-        raise BadInputError(
-            f"{folder}: expected the folder of a run (with {RECORD}): make it with astra-data run"
-            f"{did_you_mean(str(folder), known)}"
-        )
-    return folder
 
 
 _PLACES = "a folder, name@data-1.2.0, or a name (for its highest version)"
@@ -174,7 +146,6 @@ def resumable(how: str = "run the same command again to continue") -> Iterator[N
 def run_stage(recipe: Path, stage: str, **options: Any) -> Path:
     """Run one stage of a recipe, without options that are None, and print the folder of its artifacts."""
     options = {name: value for name, value in options.items() if value is not None}
-    recipe_at(recipe)
     from astra_data.pipeline.run import run_stage as run
 
     with resumable():

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from astra_data.cli import arguments
-from astra_data.cli.arguments import show_table
 from astra_data.core.errors import AstraDataError, BadInputError
-from astra_data.core.naming import RUNS, artifact_key
+from astra_data.core.naming import RUNS, artifact_key, first_few
 
 if TYPE_CHECKING:
     from astra_data.reports.choice import TrialsFile
@@ -37,7 +36,6 @@ def run(
     ] = None,
 ) -> None:
     """Run all stages of a recipe; after an interruption, run it again to continue."""
-    arguments.recipe_at(recipe)
     from astra_data.pipeline.run import run as run_recipe
 
     which: dict[str, Any] = {"methods": methods or (), "seeds": seeds or (), "percents": percents or (), "until": until}
@@ -61,7 +59,7 @@ def check(
             if of_task:
                 _check_task(name)
             else:
-                faults += _check_recipe(arguments.recipe_at(Path(name)), root, verify)
+                faults += _check_recipe(Path(name), root, verify)
         except AstraDataError as error:
             faults.append(str(error))
     if faults:
@@ -219,7 +217,6 @@ def select(
     percent: Annotated[int | None, typer.Option(help="With --trials, after a sweep: of this dataset size.")] = None,
 ) -> None:
     """Rank the trained policies of a run without the target, or with a few trials in it."""
-    arguments.run_at(run)
     if trials is None and (by_hand or field is not None or percent is not None):
         raise BadInputError("--by-hand, --field and --percent need --trials: add --trials, or leave them out")
     from astra_data.pipeline.display import shown
@@ -269,13 +266,9 @@ def deploy(
     percent: Annotated[int | None, typer.Option(help="The dataset size in percent, if the recipe has several.")] = None,
 ) -> None:
     """Export a trained policy as a folder that runs without this package."""
-    from astra_data.core.durable import refuse_existing
-
-    arguments.run_at(run)
-    out = out or run / artifact_key("deploy", row, seed, percent)
-    refuse_existing(out)
     from astra_data.deployment.folder import deploy as write
 
+    out = out or run / artifact_key("deploy", row, seed, percent)
     typer.echo(f"finished: {write(run, row, out, seed=seed, percent=percent)}")
 
 
@@ -286,7 +279,6 @@ def view(
     seed: Annotated[int | None, typer.Option(help="One of its recipe's.", show_default="the first")] = None,
 ) -> None:
     """Show a run's held-out episodes in Rerun, and replays of them in its simulators."""
-    arguments.run_at(run)
     from astra_data.pipeline.run_view import view_run
 
     view_run(run, uids or (), seed=seed, save=save)
@@ -341,9 +333,7 @@ def pair(
         raise BadInputError("pair: with a dataset, leave out --seed and --jobs (these are for recipes)")
     if simulator is None:
         raise BadInputError("pair: expected --simulator: a task or path.py:MySimulator")
-    from astra_data.dataset.versions import locate
-
-    _make("pair", simulator, settings, dataset=locate(dataset), name=name, out=out)
+    _make("pair", simulator, settings, dataset=dataset, name=name, out=out)
 
 
 @arguments.with_settings("astra_data.pipeline.stages.augment:AugmentConfig")
@@ -358,9 +348,7 @@ def augment(
     seed: Annotated[int, typer.Option(help="Random seed.")] = 0,
 ) -> None:
     """Add rotated and shifted copies of episodes in a maze; the dataset must not be paired yet."""
-    from astra_data.dataset.versions import locate
-
-    _make("augment", task, settings, dataset=locate(dataset), seed=seed, name=name, out=out)
+    _make("augment", task, settings, dataset=dataset, seed=seed, name=name, out=out)
 
 
 def label(
@@ -407,8 +395,6 @@ def new(
     """Start a project for your own robot: a task, a recipe, a mapping of its logs, a test and a page."""
     from rich.table import Table
 
-    from astra_data.core.errors import BadInputError
-    from astra_data.core.naming import first_few
     from astra_data.pipeline.first_simulator import CLEARLY, JUDGED_STEPS
     from astra_data.pipeline.new_robot import write_robot
 
@@ -424,7 +410,7 @@ def new(
     table = Table("field", "used as", "unit", "factor", "why")
     for field in found.fields:
         table.add_row(field.name, field.taken_for, field.unit, f"{field.scale:.4g}", field.why)
-    show_table(table)
+    arguments.show_table(table)
     typer.echo(f"abstract simulator: {simulator.described}")
     simulated, still = simulator.errors()
     if worse := [one for one, is_worse in zip(simulator.names, simulated > CLEARLY * still, strict=True) if is_worse]:
@@ -461,7 +447,7 @@ def list_() -> None:
         for recipe in recipes:
             summary = Text(recipe.summary, no_wrap=True, overflow="ellipsis")
             table.add_row(recipe.name, recipe.duration, summary)
-        show_table(table)
+        arguments.show_table(table)
         typer.echo()
     typer.echo(f"To begin: astra-data recipes copy {START_HERE[0]}")
 

@@ -276,11 +276,6 @@ class Condition:
     why: str = ""
     warnings: tuple[str, ...] = ()
 
-    @property
-    def is_finished(self) -> bool:
-        """Whether the artifact can be used."""
-        return self.state == "finished"
-
 
 def condition(item: Item, experiment: Experiment, *, verify: bool = False) -> Condition:
     """Return the condition of the artifact of `item`; with `verify`, every byte of it is read."""
@@ -315,7 +310,7 @@ def to_make_again(items: Collection[Item], experiment: Experiment) -> dict[str, 
     reasons, verified, to_check = dict[str, str](), set[str](), known.keys() - absent
     while to_check:
         found = {key: condition(known[key], experiment, verify=bool(verified)) for key in to_check}
-        reasons.update({key: f"{of.state} ({of.why})" for key, of in found.items() if not of.is_finished})
+        reasons.update({key: f"{of.state} ({of.why})" for key, of in found.items() if of.state != "finished"})
         for item in items:
             source = next((key for key in item.inputs if key in reasons), None)
             if source and item.key not in absent:

@@ -1,6 +1,5 @@
 """The environment in which a row is trained, also "astra_data/Grounded-v0", for others' learners; their test."""
 
-from collections.abc import Collection
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +11,7 @@ from astra_data.core.progress import Progress, silent
 from astra_data.grounding.files import GROUNDING, grounding_at
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.methods import method_named
-from astra_data.pipeline.plan import Selection, plan
+from astra_data.pipeline.plan import ARTIFACTS, Selection, plan
 from astra_data.pipeline.recipe import Recipe
 from astra_data.pipeline.trained_policy import settings_of
 from astra_data.pipeline.user_code import add_all
@@ -74,7 +73,7 @@ def evaluate_policy(
     own = UserPolicy(policy, env.observation_size, env.action_size)
     rows = list(dict.fromkeys([*settings.get("methods", []), row]))
     tested = {"seeds": [seed]} | settings | {"methods": rows}
-    evaluate = _planned(run, tested, "evaluate", row, seed, percent, ("target_encoder", "reference"))
+    evaluate = _planned(run, tested, "evaluate", row, seed, percent)
     file = PolicyFile(own, simulation, training.episodes.reference, training.episodes.content_hash)
     evaluate(policy=file, out=Path(out), progress=progress)
 
@@ -91,7 +90,7 @@ def _world(
     if unknown := sorted(options.keys() - {*OPTIONS, "num_envs"}):
         raise BadInputError(f"Grounded-v0: unknown option '{unknown[0]}'{did_you_mean(unknown[0], OPTIONS)}")
     changed = {"methods": [row], "seeds": [seed], "train": settings.get("train", {}) | options}
-    train = _planned(run, settings | changed, "train", row, seed, percent, ("dataset", "grounding")).keywords
+    train = _planned(run, settings | changed, "train", row, seed, percent).keywords
     training = Training(
         task=task_named(train["task"]),
         config=train["config"],
@@ -115,7 +114,6 @@ def _planned(
     row: str,
     seed: int,
     percent: int | None,
-    artifacts: Collection[str],
 ) -> partial[object]:
     """Return the call by which a run with these `settings` makes the artifact of a row of others."""
     recipe = validated(settings | {"select": None}, Recipe, f"{run}")
@@ -124,7 +122,7 @@ def _planned(
     call = items.get(artifact_key(stage, row, seed, percent))
     if not isinstance(call, partial):
         raise BadInputError(f"{run} has several sizes: expected percent, one of {[*recipe.sweep.percent]}")
-    places = [call.keywords[name] for name in artifacts if call.keywords[name]]
+    places = [place for name in ARTIFACTS if name != "policy" and (place := call.keywords.get(name))]
     if missing := [str(place) for place in places if not place.is_dir()]:
         raise BadInputError(f"expected {', '.join(missing)}: run the recipe first")
     return call

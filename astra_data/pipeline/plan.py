@@ -13,7 +13,7 @@ import inspect
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from itertools import product
+from itertools import product, takewhile
 from pathlib import Path
 from typing import Any
 
@@ -226,8 +226,8 @@ class _Plan:
 
     def _artifacts(self, stage: Stage, seed: int, percent: int | None, name: str) -> dict[str, str | None]:
         """Return the keys of the artifacts that a stage may read, by its parameters."""
-        datasets = [read for read in map(STAGES.get, stage.reads) if read and read.makes_dataset]
-        last = next((read for read in reversed(datasets) if self._has(read)), None)
+        before = takewhile(lambda one: one is not stage, STAGES.values())
+        *_, last = (None, *(one for one in before if one.makes_dataset and self._has(one)))
         size = percent if last and last.each == "size" else None
         artifacts = {"dataset": artifact_key(last.name, "", seed, size) if last else None}
         if not name:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 from pydantic import (
     BaseModel,
     BeforeValidator,
-    ConfigDict,
     Field,
     JsonValue,
     ValidationInfo,
@@ -25,11 +24,12 @@ from astra_data.dataset.format import INFO_PATH
 from astra_data.io.mapping import refuse_mapping
 from astra_data.methods import METHODS, method_named, tables
 from astra_data.methods.method import Table
+from astra_data.pipeline.shipped import whereabouts
 from astra_data.pipeline.stages.registry import STAGES, Stage
 from astra_data.pipeline.stages.select import judge_of
 from astra_data.pipeline.user_code import UserMethod, add_all, looked_up, with_offered
+from astra_data.reports.results import WHOLE
 from astra_data.robots.registry import task_named
-from astra_data.worlds.objective import Score
 from astra_data.worlds.user_code import place_beside
 
 _FILLED: Any = Field(default_factory=dict, validate_default=True)
@@ -56,10 +56,8 @@ def _held_out_as_ground(table: object, info: ValidationInfo) -> object:
     return {"held_out_share": share} | table
 
 
-class _Record(BaseModel):
+class _Record(BaseModel, extra="allow"):
     """What is read of a record before it is known to be a recipe of today."""
-
-    model_config = ConfigDict(extra="allow")
 
     task: str
     own_methods: dict[str, UserMethod] = {}
@@ -76,6 +74,8 @@ def read_tables(path: Path) -> dict[str, Any]:
     """Return the tables of a recipe; files of the user's, and data in a folder, are looked up beside it."""
     if os.path.isdir(path):  # of a name that is too long, too, `load_tables` tells
         _refuse_folder(path)
+    if not os.path.exists(path) and (place := whereabouts(path.name.removesuffix(".toml"))):
+        raise RecipeError(f"{path} does not exist: {place}")
     tables = load_tables(path)
     refuse_mapping(tables, path)
     task, data = tables.get("task"), tables.get("data")
@@ -95,9 +95,6 @@ def _refuse_folder(path: Path) -> None:
     if kind := "a run" if run == whole else "a dataset" if (path / INFO_PATH).is_file() else "":
         made_by = f", {run.name}.toml" if run else ""
         raise RecipeError(f"{path} is {kind}: expected the recipe that made it{made_by}")
-
-
-WHOLE = 100  # per cent: the size of a dataset that is not swept over
 
 
 class SweepConfig(Config):
@@ -142,11 +139,6 @@ class Recipe(Config):
     def settings(self) -> dict[str, JsonValue]:
         """All settings as JSON values, as a run records them."""
         return self.model_dump(mode="json")
-
-    @property
-    def headline(self) -> Score:
-        """The score by which its rows are compared first."""
-        return task_named(self.task).objective.scores[0]
 
     def settings_of(self, row: str, stage: str) -> Config | None:
         """Return the settings of a row's method, if it has any and `stage` takes them."""

@@ -32,13 +32,13 @@ from astra_data.pipeline.experiment import (
     to_make_again,
 )
 from astra_data.pipeline.plan import Selection, check_stage, plan, stages_until
-from astra_data.pipeline.recipe import WHOLE
 from astra_data.pipeline.shipped import is_shipped
 from astra_data.pipeline.stages.registry import STAGES
 from astra_data.pipeline.user_code import UserMethod, add_all, digests_of
 from astra_data.reports.artifacts import CURVE, EVALUATION, METRICS, Artifact, Evaluation, read_json
 from astra_data.reports.diagnosis import DIAGNOSIS, diagnosis_page
 from astra_data.reports.held_out import write_held_out
+from astra_data.reports.results import WHOLE
 from astra_data.reports.runs import Owner, recorded_code
 from astra_data.robots.registry import TASKS, task_named
 from astra_data.worlds.walk_through import check_task
@@ -243,7 +243,7 @@ def make(
 
         def finished(key: str) -> None:
             if key in points:
-                lines, headline = _write_points(experiment), recipe.headline
+                lines, headline = _write_points(experiment), task_named(recipe.task).objective.scores[0]
                 done = f"{len(points.keys() & lines)} of {len(points)} points"
                 show(f"{key}  done {headline.text(lines[key][headline.measure])}  ({done})")
 
@@ -274,12 +274,12 @@ def _check_inputs(experiment: Experiment, items: Collection[Item], planned: Coll
         stage, root = stage_of_key(key), experiment.folder.parent
         # The values of datasets are compared whenever they are read.
         found = condition(known[key], experiment, verify=not STAGES[stage].makes_dataset)
-        if found.is_finished:
+        if found.state == "finished":
             continue
         fault = f"{found.state} ({found.why})" if found.why else found.state
         maker = experiment.maker(stage)
         # Of the base, `run` makes what comes before the stage as well; two commands take no recipe.
-        alone = stage not in ("augment", "label") and (maker is experiment or not STAGES[stage].reads)
+        alone = stage == "collect" or (maker is experiment and stage not in ("augment", "label"))
         command = f"astra-data {stage if alone else 'run'} {maker.path}"
         option = "" if root == RUNS else f" --root {root}"
         raise MissingStageError(f"{experiment.place(key)} is {fault}: run `{command}{option}` first")

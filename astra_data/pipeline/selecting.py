@@ -201,10 +201,10 @@ def choose_by_trials(
         if sheet.results and (begun.spent or sheet.path.is_file()):
             sheet.read()
         try:
-            found = choice.halve([one.lower for one in candidates], begun.trials, attempt, field=begun.field)
-            first = candidates[found.chosen]
+            chosen, mean = choice.halve([one.lower for one in candidates], begun.trials, attempt, field=begun.field)
+            first = candidates[chosen]
             rate = choice.standings(judged, percent, rounds)[first.row, first.seed].rate
-            end = {"chosen": (first.row, first.seed), "mean": found.mean, "rate": (rate.value, rate.low, rate.high)}
+            end = {"chosen": (first.row, first.seed), "mean": mean, "rate": (rate.value, rate.low, rate.high)}
         except _LeftForLaterError:
             end = dict[str, Any]()
         done = begun.model_copy(update={"rounds": rounds} | end)

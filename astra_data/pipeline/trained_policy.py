@@ -10,7 +10,7 @@ from astra_data.core.artifact import check_made_from
 from astra_data.core.config import did_you_mean
 from astra_data.core.durable import file_digest
 from astra_data.core.errors import BadInputError
-from astra_data.core.naming import RECORD, artifact_key
+from astra_data.core.naming import RECORD, RUNS, artifact_key
 from astra_data.dataset.columns import STATE
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.statistics import ranges
@@ -92,7 +92,9 @@ def settings_of(run: str | Path) -> dict[str, Any]:
     """Return the settings of a run's recipe; the user's files are looked up in its folder and above, and else here."""
     folder = Path(run)
     if not (folder / RECORD).is_file():
-        raise BadInputError(f"{run}: expected the folder of a run (with {RECORD}): make it with astra-data run")
+        known = [str(record.parent) for record in sorted(RUNS.glob(f"*/{RECORD}"))]
+        expected = f"expected the folder of a run (with {RECORD}): make it with astra-data run"
+        raise BadInputError(f"{run}: {expected}{did_you_mean(str(run), known)}")
     settings = recorded_settings(folder)
     settings["task"] = found_near(settings["task"], folder)
     check_unchanged(settings["task"], folder)

@@ -4,7 +4,7 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
-from pydantic import ConfigDict, model_validator
+from pydantic import model_validator
 
 from astra_data.core.config import Config, validated
 from astra_data.core.errors import BadInputError, RecipeError
@@ -15,10 +15,8 @@ from astra_data.robots.registry import place_of
 from astra_data.worlds.user_code import code_digest, place_beside
 
 
-class UserMethod(Config):
+class UserMethod(Config, extra="allow"):
     """A method of your own; further keys are its settings, which the model of its `table` reads."""
-
-    model_config = ConfigDict(extra="allow")
 
     method: str
     """A file next to the recipe, "delta.py:METHOD", or "package.module:METHOD"; its code is run."""
@@ -27,11 +25,6 @@ class UserMethod(Config):
     @classmethod
     def _may_be_a_place_alone(cls, given: Any) -> Any:  # noqa: ANN401 - checked next
         return {"method": given} if isinstance(given, str) else given
-
-    def add(self, name: str) -> None:
-        """Add the method by the `name` of its rows, and check its settings."""
-        add_method(name, self.method)
-        self.settings(name)
 
     def settings(self, name: str) -> Config | None:
         """Return the settings of the method, which was added by `name`; None if it has none."""
@@ -45,9 +38,11 @@ class UserMethod(Config):
 
 
 def add_all(own_methods: Mapping[str, Any]) -> None:
-    """Add the methods of a recipe, each as the recipe names it."""
+    """Add the methods of a recipe, each as the recipe names it, and check their settings."""
     for name, given in own_methods.items():
-        UserMethod.model_validate(given).add(name)
+        own = UserMethod.model_validate(given)
+        add_method(name, own.method)
+        own.settings(name)
 
 
 def looked_up(own_methods: Mapping[str, Any], folder: Path) -> dict[str, Any]:

@@ -49,10 +49,9 @@ class Artifact(WrittenPart):
         return {name: getattr(self, name) for name in ("wall_seconds", "cpu_seconds", "finished_at")}
 
 
-class Outcomes(WrittenPart):
+class Outcomes(WrittenPart, extra="allow"):
     """Outcomes of a policy's episodes, one number per episode; further measures are kept as they are."""
 
-    model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, list[float]]
 
     success: list[float]
@@ -121,10 +120,9 @@ class Foresight(WrittenPart):
     reliability: list[tuple[float, float, int]] | None = None
 
 
-class Metrics(Artifact):
+class Metrics(Artifact, extra="allow", allow_inf_nan=False):
     """metrics.json of one row and seed's grounding or alignment; further figures are kept as they are."""
 
-    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
     __pydantic_extra__: dict[str, JsonValue]
 
     epochs: list[dict[str, JsonValue]] = Field(default_factory=list)

@@ -24,15 +24,6 @@ Attempt = Callable[[int, tuple[int, ...], int], Sequence[int]]
 """Given a round's number, its candidates and the trials of each, returns how many of these succeeded."""
 
 
-@dataclass(frozen=True)
-class Halving:
-    """The candidates of each round with the trials of each, the one that is left, and its posterior mean success."""
-
-    rounds: tuple[tuple[tuple[int, ...], int], ...]
-    chosen: int
-    mean: float
-
-
 def least_trials(field: int) -> int:
     """Return how many trials are needed to halve so many candidates until one is left."""
     return 0 if field < 2 else LEAST_TRIALS * field + least_trials(ceil(field / 2))
@@ -48,11 +39,11 @@ def posterior(prior: float, successes: int, trials: int) -> float:
     return (PSEUDO_TRIALS * prior + successes) / (PSEUDO_TRIALS + trials)
 
 
-def halve(priors: Sequence[float], trials: int, attempt: Attempt, *, field: int | None = None) -> Halving:
-    """Halve the first `field` candidates, by their success's posterior mean, in equal rounds, until one is left."""
+def halve(priors: Sequence[float], trials: int, attempt: Attempt, *, field: int | None = None) -> tuple[int, float]:
+    """Halve the first `field` candidates in equal rounds, by the posterior mean of success; return the last, and it."""
     left = tuple(range(widest_field(len(priors), trials) if field is None else field))
     spent, successes = [0] * len(priors), [0] * len(priors)
-    rounds: list[tuple[tuple[int, ...], int]] = []
+    number = 0
 
     def mean(one: int) -> float:
         return posterior(priors[one], successes[one], spent[one])
@@ -60,13 +51,13 @@ def halve(priors: Sequence[float], trials: int, attempt: Attempt, *, field: int 
     while len(left) > 1:
         to_come = ceil(log2(len(left)))
         each = max(LEAST_TRIALS, trials // to_come // len(left))
-        for one, count in zip(left, attempt(len(rounds), left, each), strict=True):
+        for one, count in zip(left, attempt(number, left, each), strict=True):
             spent[one] += each
             successes[one] += count
         trials -= each * len(left)
-        rounds.append((left, each))
+        number += 1
         left = tuple(sorted(left, key=lambda one: (-mean(one), one))[: ceil(len(left) / 2)])
-    return Halving(tuple(rounds), left[0], mean(left[0]))
+    return left[0], mean(left[0])
 
 
 class Tried(WrittenPart):

@@ -120,8 +120,6 @@ def read_run(
     rows, seeds, run = reported.methods, reported.seeds, RunReader(root)
     files: list[artifacts.Evaluation] = []
     trainings: list[results.TrainingFacts] = []
-    if not rows or not seeds:
-        raise BadInputError(f"{reported.name}: expected methods and seeds, got none; name some in the recipe")
     for percent in reported.percents or (None,):
         owners = [Owner(row, seed, percent) for row in rows for seed in seeds]
         finished = [owner for owner in owners if run.path("evaluate", owner, artifacts.EVALUATION).is_file()]

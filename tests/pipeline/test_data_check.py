@@ -77,7 +77,7 @@ def test_steps_that_do_not_lead_to_the_row_after_them_are_told(
     write_logs(recipe.parent / "logs", -1.0, 4.0, ahead=0.5)
     found = check(recipe, root=recipe.parent / "runs")["data"]
     what = f"steps whose {NEXT_STATE} is not the state of the next row: 16 of 16: rows are missing"
-    assert found.is_finished and found.warnings[0].startswith(what)
+    assert found.state == "finished" and found.warnings[0].startswith(what)
     run(recipe, root=recipe.parent / "runs", until="label", jobs=1)
     assert f"warning: data: {found.warnings[0]}\n" in capsys.readouterr().out
 
@@ -114,7 +114,7 @@ def test_data_of_which_none_is_left_to_train_on_are_refused(recipe: Path) -> Non
     with pytest.raises(BadInputError, match=told):
         check(recipe, root=recipe.parent / "runs")
     recipe.write_text(recipe.read_text().replace("nas", "direct_transfer"))
-    assert check(recipe, root=recipe.parent / "runs")["data"].is_finished
+    assert check(recipe, root=recipe.parent / "runs")["data"].state == "finished"
 
 
 @pytest.mark.parametrize(
@@ -132,7 +132,7 @@ def test_the_smallest_size_of_a_sweep_has_to_leave_some(recipe: Path, percent: s
         with pytest.raises(BadInputError, match=told):
             check(recipe, root=recipe.parent / "runs")
     else:
-        assert check(recipe, root=recipe.parent / "runs")["data"].is_finished
+        assert check(recipe, root=recipe.parent / "runs")["data"].state == "finished"
 
 
 def test_copies_of_one_recording_are_one_in_a_size_of_a_sweep(recipe: Path) -> None:

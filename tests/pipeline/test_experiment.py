@@ -123,7 +123,7 @@ def test_a_run_reads_what_the_base_made_and_makes_only_the_rest(
     assert links == {"collect", "pair", "ground", "train", "align"}
     policy = stages.asked["evaluate/astra_plus/seed_1"]["policy"]
     assert policy == folder / "train/astra_plus/seed_1" and policy.is_dir()
-    assert all(found.is_finished for found in check(longer, root=tmp_path).values())
+    assert all(found.state == "finished" for found in check(longer, root=tmp_path).values())
     # Links and all, the runs may be moved.
     for name in ("base", "longer"):
         shutil.move(tmp_path / name, tmp_path / f"moved/{name}")
@@ -138,7 +138,7 @@ def test_changes_are_told_in_the_base_and_here(base: Path, longer: Path, tmp_pat
     with pytest.raises(RecipeError, match=told):
         run(longer, root=tmp_path)
     found = check(longer, root=tmp_path)
-    assert found["train/astra/seed_0"].state == "stale" and found["ground/astra/seed_0"].is_finished
+    assert found["train/astra/seed_0"].state == "stale" and found["ground/astra/seed_0"].state == "finished"
     base.write_text(BASE)
     longer.write_text(LONGER.replace("3", "4"))
     with pytest.raises(RecipeError, match=rf"now 4\) changed .* since {folder} was made: .* remove {folder}/ev"):

@@ -113,7 +113,7 @@ def test_other_data_of_the_same_name_are_labeled_anew(cart: Path, tmp_path: Path
     experiment = load_experiment(path, tmp_path / "runs")
     (item,) = [item for item in plan(experiment.recipe, path, experiment.folder) if item.key == "label/seed_0"]
     item.call(progress=silent)
-    assert (experiment.folder / "label/seed_0").is_symlink() and condition(item, experiment).is_finished
+    assert (experiment.folder / "label/seed_0").is_symlink() and condition(item, experiment).state == "finished"
     # What was made of it since is no other; what was made of another is.
     link = experiment.folder / "label/seed_0"
     older = shutil.copytree(whole, tmp_path / "older")
@@ -121,7 +121,7 @@ def test_other_data_of_the_same_name_are_labeled_anew(cart: Path, tmp_path: Path
     filter_episodes(Dataset.open(older), without=Dataset.open(older).uids[:1].tolist(), out=whole)
     link.unlink()
     link.symlink_to(older)
-    assert condition(item, experiment).is_finished
+    assert condition(item, experiment).state == "finished"
     import_dataset(drives[4:], CART / "logs.toml", out=tmp_path / "others")
     link.unlink()
     link.symlink_to(label(experiment.recipe.task, data=tmp_path / "others", out=tmp_path / "labeled"))

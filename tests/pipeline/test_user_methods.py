@@ -18,19 +18,13 @@ DELTA, ENSEMBLE = (f"{EXAMPLES}/{name}.py:METHOD" for name in ("delta_action", "
 
 
 def test_a_place_alone_is_a_method_with_its_usual_settings() -> None:
+    add_all({"delta": DELTA, "plain": {"method": ENSEMBLE}})
+    assert {"delta", "plain"} <= METHODS.keys()
     own = UserMethod.model_validate(DELTA)
-    own.add("delta")
     settings = own.settings("delta")
     assert settings is not None and settings.model_dump() == {"memory": 32, "learning_rate": 0.003}
     assert own.model_dump() == {"method": DELTA}
-    plain = UserMethod.model_validate(ENSEMBLE)
-    plain.add("plain")
-    assert plain.settings("plain") is None
-
-
-def test_all_of_a_recipe_are_added_as_recipe_json_has_them() -> None:
-    add_all({"one": DELTA, "other": {"method": ENSEMBLE}})
-    assert {"one", "other"} <= METHODS.keys()
+    assert UserMethod.model_validate(ENSEMBLE).settings("plain") is None
 
 
 def test_the_process_of_an_item_knows_them_and_uses_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:

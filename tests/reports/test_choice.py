@@ -1,6 +1,6 @@
 import json
 from collections.abc import Sequence
-from itertools import product
+from itertools import pairwise, product
 from math import ceil
 from pathlib import Path
 from statistics import fmean
@@ -178,8 +178,19 @@ def drawn(success: Sequence[float], rng: np.random.Generator) -> Attempt:
     return lambda _, those, each: [int(rng.binomial(each, success[one])) for one in those]
 
 
-def certain(success: Sequence[int]) -> Attempt:
-    return lambda _, those, each: [each * success[one] for one in those]
+Rounds = list[tuple[tuple[int, ...], int]]
+
+
+def certain(success: Sequence[int], rounds: Rounds | None = None) -> Attempt:
+    """Succeed always or never, and note the candidates of each round with the trials of each in `rounds`."""
+    noted: Rounds = [] if rounds is None else rounds
+
+    def attempt(number: int, those: tuple[int, ...], each: int) -> list[int]:
+        assert number == len(noted)
+        noted.append((those, each))
+        return [each * success[one] for one in those]
+
+    return attempt
 
 
 def refused(*_: object) -> list[int]:
@@ -187,10 +198,11 @@ def refused(*_: object) -> list[int]:
 
 
 def test_rounds_share_the_trials_and_so_do_their_candidates() -> None:
-    found = halve([0.9, 0.8, 0.7, 0.6, 0.5], 60, certain([0, 0, 0, 1, 1]))
-    assert found.rounds == (((0, 1, 2, 3, 4), 4), ((3, 4, 0), 6), ((3, 4), 11))
-    assert sum(len(those) * each for those, each in found.rounds) == 60
-    assert found.chosen == 3 and found.mean == pytest.approx((4 * 0.6 + 21) / (4 + 21))
+    rounds: Rounds = []
+    found = halve([0.9, 0.8, 0.7, 0.6, 0.5], 60, certain([0, 0, 0, 1, 1], rounds))
+    assert rounds == [((0, 1, 2, 3, 4), 4), ((3, 4, 0), 6), ((3, 4), 11)]
+    assert sum(len(those) * each for those, each in rounds) == 60
+    assert found == pytest.approx((3, (4 * 0.6 + 21) / (4 + 21)))
 
 
 def test_the_field_is_as_wide_as_the_trials_allow() -> None:
@@ -200,25 +212,26 @@ def test_the_field_is_as_wide_as_the_trials_allow() -> None:
     for field, trials in product(range(2, 20), range(4, 150)):
         if trials < least_trials(field):
             continue
-        found = halve([0.5] * field, trials, certain([1] * field), field=field)
-        assert all(each >= LEAST_TRIALS for _, each in found.rounds)
-        assert sum(len(those) * each for those, each in found.rounds) <= trials and len(found.rounds[0][0]) == field
-        for (those, _), (after, _) in zip(found.rounds, found.rounds[1:], strict=False):
+        rounds: Rounds = []
+        halve([0.5] * field, trials, certain([1] * field, rounds), field=field)
+        assert all(each >= LEAST_TRIALS for _, each in rounds)
+        assert sum(len(those) * each for those, each in rounds) <= trials and len(rounds[0][0]) == field
+        for (those, _), (after, _) in pairwise(rounds):
             assert len(after) == ceil(len(those) / 2)
 
 
 def test_ties_go_to_what_the_prediction_prefers() -> None:
     for success in (0, 1):
-        assert halve([0.5] * 4, 40, certain([success] * 4)).chosen == 0
-    found = halve([0.2, 0.9], 0, refused)  # without trials, the first is preferred, whatever the figures
-    assert found.chosen == 0 and found.rounds == () and found.mean == pytest.approx(0.2)
+        assert halve([0.5] * 4, 40, certain([success] * 4))[0] == 0
+    # Without trials, the first is preferred, whatever the figures.
+    assert halve([0.2, 0.9], 0, refused) == pytest.approx((0, 0.2))
 
 
 def test_trials_outweigh_a_wrong_prediction_and_a_prediction_counts_as_a_few() -> None:
     assert posterior(0.75, 0, 0) == 0.75 and posterior(1.0, 0, PSEUDO_TRIALS) == 0.5
-    assert halve([1.0, 0.0], 4 * PSEUDO_TRIALS, certain([0, 1])).chosen == 1
+    assert halve([1.0, 0.0], 4 * PSEUDO_TRIALS, certain([0, 1]))[0] == 1
     # With as many trials as the prediction counts as, a full swing is a tie; with fewer, it prevails.
-    assert halve([1.0, 0.0], 2 * PSEUDO_TRIALS, certain([0, 1])).chosen == 0
+    assert halve([1.0, 0.0], 2 * PSEUDO_TRIALS, certain([0, 1]))[0] == 0
 
 
 def test_the_best_of_four_is_found_as_often_as_all_outcomes_say() -> None:
@@ -236,5 +249,5 @@ def test_the_best_of_four_is_found_as_often_as_all_outcomes_say() -> None:
             chosen = min(one, other) if tied else one if wins else other
             expected += weight * chance * (chosen == 3)
     rng = np.random.default_rng(0)
-    found = [halve(priors, 16, drawn(success, rng)).chosen == 3 for _ in range(4000)]
+    found = [halve(priors, 16, drawn(success, rng))[0] == 3 for _ in range(4000)]
     assert np.mean(found) == pytest.approx(expected, abs=0.025)

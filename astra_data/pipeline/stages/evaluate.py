@@ -124,7 +124,7 @@ def evaluate(
             )
             for kind, robot in row.robots.items()
         }
-        if row.is_policy:
+        if row.facts:
             outcomes = {kind: episodes.outcome.to_json() for kind, episodes in tested.items()}
             measures = [score.measure for score in world.objective.scores]
             results["encoders"] = {kind: {one: fmean(of[one]) for one in measures} for kind, of in outcomes.items()}
@@ -162,8 +162,7 @@ class _Row:
     headline: EncoderKind
     simulators: dict[str, SimulatorEnv] = field(default_factory=dict)
     shown_abstract: bool = True
-    is_policy: bool = False
-    facts: dict[str, Any] = field(default_factory=dict)
+    facts: dict[str, Any] = field(default_factory=dict)  # of its policy, if it is one
 
 
 def _policy(task: Task, loaded: PolicyFile | None, files: Mapping[str, Path], config: EvaluateConfig) -> _Row:
@@ -187,7 +186,7 @@ def _policy(task: Task, loaded: PolicyFile | None, files: Mapping[str, Path], co
     if trained.simulation is not None:
         simulators["simulated"] = training_env(task, trained.simulation, grounding, num_envs=config.episodes)
     begin, is_abstract = partial(started, source, source.act_in_simulator), trained.observed == "abstract"
-    return _Row(begin, robots, headline, simulators, is_abstract, is_policy=True, facts=facts)
+    return _Row(begin, robots, headline, simulators, is_abstract, facts)
 
 
 def _careful_in_target(task: Task, goal: Tensor) -> Act:

@@ -31,7 +31,6 @@ class Stage:
     run: Callable[..., object]
     each: Literal["seed", "size", "grounding", "policy", "alignment", "row", "recipe"]
     """What it makes one artifact for; all but the seed, its sizes and the recipe once per dataset."""
-    reads: tuple[str, ...] = ()  # the stages whose artifacts it may read
     config: Any = None  # the type of its table in a recipe; None where it has no settings
     asked_by: str | None = None  # the key of recipes without which the stage is left out; None if all have it
     result: str | None = None  # the file of its artifacts that other stages read; None for datasets and the report
@@ -42,22 +41,19 @@ class Stage:
         return self.each in ("seed", "size")
 
 
-_OF_DATASET = ("pair", "subset")
-_OF_GROUNDING = (*_OF_DATASET, "ground")
-
 STAGES: dict[str, Stage] = {
     stage.name: stage
     for stage in (
-        Stage("collect", collect, "seed", (), CollectConfig, "collect"),
+        Stage("collect", collect, "seed", CollectConfig, "collect"),
         Stage("label", label, "seed", asked_by="data"),
-        Stage("augment", augment, "seed", ("collect", "label"), AugmentConfig, "augment"),
-        Stage("pair", pair, "seed", ("collect", "label", "augment"), PairConfig),
-        Stage("subset", subset, "size", ("pair",)),
-        Stage("ground", ground, "grounding", _OF_DATASET, GroundConfig, result=GROUNDING),
-        Stage("train", train, "policy", _OF_GROUNDING, AnyTrainConfig, result=POLICY),
-        Stage("align", align, "alignment", _OF_GROUNDING, AlignConfig, result=TARGET_ENCODER),
-        Stage("select", select, "recipe", (*_OF_GROUNDING, "train"), SelectConfig, "select", SELECTED),
-        Stage("evaluate", evaluate, "row", ("train", "ground", "align"), EvaluateConfig, result=EVALUATION),
-        Stage("report", report, "recipe", ("evaluate",), ReportConfig),
+        Stage("augment", augment, "seed", AugmentConfig, "augment"),
+        Stage("pair", pair, "seed", PairConfig),
+        Stage("subset", subset, "size"),
+        Stage("ground", ground, "grounding", GroundConfig, result=GROUNDING),
+        Stage("train", train, "policy", AnyTrainConfig, result=POLICY),
+        Stage("align", align, "alignment", AlignConfig, result=TARGET_ENCODER),
+        Stage("select", select, "recipe", SelectConfig, "select", SELECTED),
+        Stage("evaluate", evaluate, "row", EvaluateConfig, result=EVALUATION),
+        Stage("report", report, "recipe", ReportConfig),
     )
-}  # in the order of the pipeline
+}  # in the order of the pipeline: a dataset is made of the one before it

@@ -62,8 +62,6 @@ def report(
     from astra_data.reports.figures.style import Scene
     from astra_data.reports.page import sections_of
 
-    for row in (*config.trajectory_methods, *config.paper_success, *config.compare):
-        method_named(row)
     task = task_named(recipe.task)
     found = read_run(
         replace(recipe, task=task.name),  # not where its file is
@@ -81,20 +79,19 @@ def report(
     images = drawn(found, scene)
     progress(0.9, f"{len(images)} figures")
     sections = sections_of(found, f"runs/{root.name}" if root.is_absolute() else str(root))  # as commands name it
-    with finished_folder(root / "report", replace=True, made_from=_digests(recipe, root)) as folder:
-        write_file(folder / JSON, results_json(found))
-        write_file(folder / PAGE, markdown(found.recipe, sections, {name: f"{name}.png" for name in images}))
-        write_file(folder / HTML, html(found.recipe, sections, images))
-        for name, image in images.items():
-            write_file(folder / f"{name}.png", image)
-    if publish is not None:
-        folder = publish / recipe.name
-        folder.mkdir(parents=True, exist_ok=True)
+
+    def write(folder: Path) -> None:
         for name, image in images.items():
             write_file(folder / f"{name}.png", image)
         shown = {name: file for name in FIGURES if (folder / (file := f"{name}.png")).exists()}
         write_file(folder / JSON, results_json(found))
         write_file(folder / PAGE, markdown(found.recipe, sections, shown))
+
+    with finished_folder(root / "report", replace=True, made_from=_digests(recipe, root)) as folder:
+        write(folder)
+        write_file(folder / HTML, html(found.recipe, sections, images))
+    if publish is not None:
+        write(publish / recipe.name)
     progress(1.0, verdict_of(found).text.replace("**", ""))
 
 

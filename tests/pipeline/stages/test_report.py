@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import pytest
 from fake_dataset import write_fake
-from fake_report import COMMAND, CONFIG, FIGURES, REPLAY, images, make, task
+from fake_report import COMMAND, FIGURES, REPLAY, images, make, task
 from fake_runs import (
     ROWS,
     SEEDS,
@@ -31,7 +31,6 @@ from astra_data.core.durable import file_digest
 from astra_data.core.errors import BadInputError, MissingStageError
 from astra_data.core.naming import artifact_key
 from astra_data.pipeline.stages import report as stage
-from astra_data.pipeline.stages.report import report
 from astra_data.reports.figures import catalog as figures
 from astra_data.reports.results import read_results
 from astra_data.worlds.objective import RETURN, SURVIVED_STEPS
@@ -97,12 +96,6 @@ def test_the_table_of_methods_has_the_targets_column_first(target: str) -> None:
     assert (astra["lost"], astra["failed"], astra["seeds"]) == ("0.25", "0.50 ± 0.25", "3")
     assert plus["path length to success (m)"] == "8.0 ± 0.0"
     assert table["Careful follower (ceiling)"]["in its simulator"] == "-" and "Direct transfer (floor)" in table
-
-
-@pytest.mark.parametrize("changed", [{"paper_success": {"astar": 0.4}}, {"compare": ("astar",)}])
-def test_a_row_that_is_no_method_is_refused(root: Path, changed: dict[str, object]) -> None:
-    with pytest.raises(BadInputError, match="astar"):
-        report(FakeRecipe(), root=root, command="", config=CONFIG.model_copy(update=changed))
 
 
 def test_intervals_and_probabilities_of_improvement_need_three_seeds(root: Path, target: str) -> None:
