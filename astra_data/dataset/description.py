@@ -18,7 +18,6 @@ from astra_data.core.errors import BadInputError, CorruptDatasetError, unmet
 from astra_data.core.provenance import origin
 from astra_data.dataset import format as layout
 from astra_data.dataset.columns import Array
-from astra_data.dataset.format import DATASET_PATH, DIGESTS_PATH
 from astra_data.dataset.parquet import to_arrow, to_numpy
 from astra_data.dataset.plain import episodes_files, read_object, read_small_table
 
@@ -123,13 +122,13 @@ def permutation(uids: Iterable[int], seed: int) -> list[int]:
 
 def read_description(root: Path) -> dict[str, Any]:
     """Return meta/astra/dataset.json: the result of `complete_description`, the content hash, and more."""
-    found = read_object(root / DATASET_PATH)
+    found = read_object(root / layout.DATASET_PATH)
     if isinstance(found, str):
-        raise CorruptDatasetError(f"{DATASET_PATH} {found}")
-    if not isinstance(sums := found.get("sums"), dict) or sums.get(DATASET_PATH) != _sum_of(found):
-        raise CorruptDatasetError(f"{DATASET_PATH} was altered")
+        raise CorruptDatasetError(f"{layout.DATASET_PATH} {found}")
+    if not isinstance(sums := found.get("sums"), dict) or sums.get(layout.DATASET_PATH) != _sum_of(found):
+        raise CorruptDatasetError(f"{layout.DATASET_PATH} was altered")
     if faults := _faults({key: found.get(key) for key in _DEFAULTS}):
-        raise CorruptDatasetError(f"{DATASET_PATH}: {'; '.join(faults)}")
+        raise CorruptDatasetError(f"{layout.DATASET_PATH}: {'; '.join(faults)}")
     return found
 
 
@@ -151,17 +150,17 @@ def alteration(columns: Sequence[str], path: Path, row: int, steps: int, episode
 def write_digests(root: Path, digests: Mapping[str, ArrayLike]) -> None:
     """Write meta/astra/digests.parquet, plain: random bits neither compress nor repeat."""
     table = pa.table({name: to_arrow(np.asarray(values, np.uint64)) for name, values in digests.items()})
-    pq.write_table(table, root / DIGESTS_PATH, compression="none", use_dictionary=False, write_statistics=False)
+    pq.write_table(table, root / layout.DIGESTS_PATH, compression="none", use_dictionary=False, write_statistics=False)
 
 
 def read_digests(root: Path, columns: Collection[str], altered: Collection[str] = ()) -> Digests:
     """Return the digests of `columns`, unless their file is among those `altered`."""
-    table = "was altered" if DIGESTS_PATH in altered else read_small_table(root / DIGESTS_PATH)
+    table = "was altered" if layout.DIGESTS_PATH in altered else read_small_table(root / layout.DIGESTS_PATH)
     if isinstance(table, str):
-        raise CorruptDatasetError(f"{DIGESTS_PATH} {table}")
+        raise CorruptDatasetError(f"{layout.DIGESTS_PATH} {table}")
     whole = [field.name for field in table.schema if field.type == pa.uint64()]
     if sorted(whole) != sorted(columns) or any(column.null_count for column in table.columns):
-        raise CorruptDatasetError(f"{DIGESTS_PATH} has other columns than the data")
+        raise CorruptDatasetError(f"{layout.DIGESTS_PATH} has other columns than the data")
     return {name: to_numpy(table.column(name), 1, "uint64") for name in columns}
 
 
@@ -169,13 +168,13 @@ def sealed(root: Path, description: Mapping[str, Any]) -> dict[str, Any]:
     """Return `description`, as JSON gives it back, with the sums of the files in folder `root`."""
     sums = {path: file_digest(root / path) for path in (*SEALED, *_episodes(root))}
     full: dict[str, Any] = json.loads(json.dumps({**description, "sums": sums}))
-    full["sums"][DATASET_PATH] = _sum_of(full)
+    full["sums"][layout.DATASET_PATH] = _sum_of(full)
     return full
 
 
 def altered_files(root: Path, description: Mapping[str, Any]) -> list[str]:
     """Return the sealed files in folder `root` that were altered or are missing, and those added to them."""
-    sums = {path: value for path, value in description.get("sums", {}).items() if path != DATASET_PATH}
+    sums = {path: value for path, value in description.get("sums", {}).items() if path != layout.DATASET_PATH}
     paths = (*SEALED, *sorted({*sums, *_episodes(root)} - {*SEALED})) if sums else ()
     return [path for path in paths if not (root / path).is_file() or file_digest(root / path) != sums.get(path)]
 
@@ -185,6 +184,6 @@ def _episodes(root: Path) -> list[str]:
 
 
 def _sum_of(description: Mapping[str, Any]) -> str:
-    sums = {path: value for path, value in description["sums"].items() if path != DATASET_PATH}
+    sums = {path: value for path, value in description["sums"].items() if path != layout.DATASET_PATH}
     text = json.dumps({**description, "sums": sums}, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()

@@ -26,9 +26,27 @@ def fake(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 
 
 @pytest.fixture
+def dataset(tmp_path: Path) -> Dataset:
+    """A fake dataset of the test's own, which it may damage."""
+    return write_fake(tmp_path / "set")
+
+
+@pytest.fixture
+def root(dataset: Dataset) -> Path:
+    """The folder of `dataset`."""
+    return dataset.root
+
+
+@pytest.fixture
 def lonely(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each episode gets a row group of its own."""
     monkeypatch.setattr(parquet, "GROUP_ROWS", 1)
+
+
+@pytest.fixture
+def scattered(lonely: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each episode gets a file of its own."""
+    monkeypatch.setattr(parquet, "FILE_SIZE_LIMIT", 500)
 
 
 @pytest.fixture(scope="session")

@@ -23,8 +23,7 @@ def test_equal_datasets_do_not_differ(tmp_path: Path) -> None:
     assert found == Differences(schema=[], only_in_a=[], only_in_b=[], values=[], metadata={}, description=[])
 
 
-def test_every_kind_of_difference_is_told(tmp_path: Path) -> None:
-    a = write_fake(tmp_path / "a")
+def test_every_kind_of_difference_is_told(fake: Dataset, tmp_path: Path) -> None:
     columns = [*COLUMNS[:-1], Column("other", "int64")]
     changed = dict(DESCRIPTION) | {"config": {"episodes": 5, "noise_m": 0.2}, "version": "1.1.0"}
     with writer(tmp_path / "b", columns=columns, fps=10, description=changed) as open_writer:
@@ -35,7 +34,7 @@ def test_every_kind_of_difference_is_told(tmp_path: Path) -> None:
                 values[STATE] = values[STATE] + 1
             metadata = dict(fake_episode(uid, length).metadata) | ({"return": 9.0} if uid == 4 else {})
             open_writer.add(Episode(uid, values, metadata))
-    found = differences(a, Dataset.open(tmp_path / "b"))
+    found = differences(fake, Dataset.open(tmp_path / "b"))
     assert found.schema == [
         "column mode: only in fake@data-1.0.0",
         "column other: only in fake@data-1.1.0",

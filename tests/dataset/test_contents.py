@@ -5,7 +5,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from damaged import edit, reseal, truncate
-from fake_dataset import LENGTHS, concatenated, write_fake
+from fake_dataset import LENGTHS, concatenated
 
 from astra_data.core.errors import CorruptDatasetError
 from astra_data.dataset import Dataset, parquet
@@ -42,8 +42,7 @@ def forged(**changes: object) -> Callable[[Path], None]:
         (forged(features={"action": 3}), ["its metadata are not those of a dataset"]),
     ],
 )
-def test_damage_is_told_in_one_line(tmp_path: Path, damage: Callable[[Path], object], parts: list[str]) -> None:
-    root = write_fake(tmp_path / "set").root
+def test_damage_is_told_in_one_line(root: Path, damage: Callable[[Path], object], parts: list[str]) -> None:
     damage(root)
     with pytest.raises(CorruptDatasetError) as caught:
         Dataset.open(root)
@@ -58,10 +57,9 @@ def test_damage_is_told_in_one_line(tmp_path: Path, damage: Callable[[Path], obj
 @pytest.mark.parametrize("block_rows", [1, 20, 2**16])
 @pytest.mark.parametrize(("group_rows", "chosen"), [(4, [0, 1, 2, 3, 4]), (13, [1, 3]), (1000, [4])])
 def test_blocks_are_whole_episodes_whatever_the_row_groups(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block_rows: int, group_rows: int, chosen: list[int]
+    dataset: Dataset, monkeypatch: pytest.MonkeyPatch, block_rows: int, group_rows: int, chosen: list[int]
 ) -> None:
     monkeypatch.setattr(parquet, "BLOCK_ROWS", block_rows)
-    dataset = write_fake(tmp_path / "set")
     [path] = dataset.paths
     pq.write_table(pq.read_table(path), path, row_group_size=group_rows)
     found, values = [], []

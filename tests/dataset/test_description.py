@@ -8,7 +8,7 @@ import pyarrow.parquet as pq
 import pytest
 import xxhash
 from damaged import DATA, EPISODES, alter, edit, reseal
-from fake_dataset import concatenated, fake_episodes, write_fake
+from fake_dataset import concatenated, fake_episodes
 
 from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.dataset import Dataset, description, parquet
@@ -96,8 +96,7 @@ def test_data_stays_inside_the_folder(pattern: object, is_one: bool) -> None:
     assert is_data_path(pattern) is is_one
 
 
-def test_every_fault_of_a_forged_description_is_told_at_once(tmp_path: Path) -> None:
-    root = write_fake(tmp_path / "set").root
+def test_every_fault_of_a_forged_description_is_told_at_once(root: Path) -> None:
     edit(DATASET_PATH, name="a/b", parents=[{"name": "x"}], config=3)(root)
     reseal(root)
     with pytest.raises(CorruptDatasetError) as caught:
@@ -117,10 +116,9 @@ def test_the_file_holds_a_digest_of_each_episode_and_column(fake: Dataset) -> No
 @pytest.mark.parametrize("block_rows", [1, 2**16])
 @pytest.mark.parametrize("rows", [3, 10, 1000])
 def test_an_altered_value_is_refused_before_it_is_seen(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block_rows: int, rows: int
+    root: Path, monkeypatch: pytest.MonkeyPatch, block_rows: int, rows: int
 ) -> None:
     monkeypatch.setattr(parquet, "BLOCK_ROWS", block_rows)
-    root = write_fake(tmp_path / "set").root
     alter(DATA, REWARD, 25, 9.0)(root)
     pq.write_table(pq.read_table(root / DATA), root / DATA, row_group_size=rows)
     dataset = Dataset.open(root)
@@ -142,8 +140,7 @@ def test_an_altered_value_is_refused_before_it_is_seen(
         np.testing.assert_array_equal(found, expected.columns[REWARD])
 
 
-def test_a_file_that_shrinks_while_it_is_open_is_refused(tmp_path: Path) -> None:
-    dataset = write_fake(tmp_path / "set")
+def test_a_file_that_shrinks_while_it_is_open_is_refused(dataset: Dataset) -> None:
     table = pq.read_table(dataset.root / DATA)
     for rows in (table.slice(0, 50), pa.concat_tables([table, table.slice(0, 1)])):
         pq.write_table(rows, dataset.root / DATA)
@@ -166,8 +163,7 @@ def test_digests_that_do_not_fit_are_refused(tmp_path: Path, table: pa.Table) ->
         description.read_digests(tmp_path, [REWARD, ACTION])
 
 
-def test_the_sums_are_those_of_the_files(tmp_path: Path) -> None:
-    dataset = write_fake(tmp_path / "set")
+def test_the_sums_are_those_of_the_files(dataset: Dataset) -> None:
     sums = dict(dataset.description["sums"])
     sums.pop(DATASET_PATH)
     assert sums == {
@@ -177,8 +173,7 @@ def test_the_sums_are_those_of_the_files(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", [*description.SEALED, EPISODES])
-def test_every_sealed_file_is_known_when_altered_or_missing(path: str, tmp_path: Path) -> None:
-    dataset = write_fake(tmp_path / "set")
+def test_every_sealed_file_is_known_when_altered_or_missing(path: str, dataset: Dataset) -> None:
     with (dataset.root / path).open("ab") as file:
         file.write(b" ")
     assert description.altered_files(dataset.root, dataset.description) == [path]
@@ -187,8 +182,7 @@ def test_every_sealed_file_is_known_when_altered_or_missing(path: str, tmp_path:
 
 
 @pytest.mark.parametrize("change", [{"seeds": {}}, {"content_hash": "0" * 64}, {"more": 1}])
-def test_the_description_seals_itself(change: dict[str, object], tmp_path: Path) -> None:
-    root = write_fake(tmp_path / "set").root
+def test_the_description_seals_itself(change: dict[str, object], root: Path) -> None:
     edit(DATASET_PATH, **change)(root)
     with pytest.raises(CorruptDatasetError, match=r"^meta/astra/dataset\.json was altered$"):
         description.read_description(root)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fake_dataset import COLUMNS, DESCRIPTION, assert_same, fake_episode, write_fake, writer
+from fake_dataset import COLUMNS, DESCRIPTION, assert_same, fake_episode, writer
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import REWARD, STATE, Column, Episode
@@ -197,8 +197,7 @@ def test_datasets_of_different_worlds_are_not_merged(tmp_path: Path, world: str)
     assert not (tmp_path / "all").exists()
 
 
-def test_datasets_that_differ_are_told_apart(tmp_path: Path) -> None:
-    a = write_fake(tmp_path / "a")
+def test_datasets_that_differ_are_told_apart(fake: Dataset, tmp_path: Path) -> None:
     columns = [*COLUMNS[:-1], Column("other", "int64")]
     with writer(tmp_path / "b", columns=columns, fps=10, task="walk") as open_writer:
         episode = fake_episode(1, 4)
@@ -206,12 +205,12 @@ def test_datasets_that_differ_are_told_apart(tmp_path: Path) -> None:
         values["other"] = values.pop("mode")
         open_writer.add(episode.__class__(1, values))
     with pytest.raises(BadInputError) as caught:
-        merge([a, Dataset.open(tmp_path / "b")], out=tmp_path / "all")
+        merge([fake, Dataset.open(tmp_path / "b")], out=tmp_path / "all")
     for part in ("column mode: only in", "column other: only in", "fps: 20, then 10"):
         assert part in str(caught.value)
     assert "an import of its files" not in str(caught.value)
     with pytest.raises(BadInputError, match="two datasets or more"):
-        merge([a], out=tmp_path / "all")
+        merge([fake], out=tmp_path / "all")
     assert not (tmp_path / "all").exists()
 
 

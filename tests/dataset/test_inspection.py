@@ -45,12 +45,11 @@ def test_episodes_are_summed_up(inspection: Inspection) -> None:
     assert (inspection.reference, inspection.fps) == ("fake@data-1.0.0", 20)
 
 
-def test_a_robot_that_never_moved_has_a_map_of_one_cell(tmp_path: Path) -> None:
+def test_a_robot_that_never_moved_has_a_map_of_one_cell(fake: Dataset, tmp_path: Path) -> None:
     root = tmp_path / "still"
-    source = write_fake(tmp_path / "fake")
-    columns = source.schema
+    columns = fake.schema
     with DatasetWriter(root, columns, fps=20, task="rest", description={"name": "still", "stage": "x"}) as writer:
-        for episode in source.episodes():
+        for episode in fake.episodes():
             episode.columns[STATE][:] = 1.5
             writer.add(episode)
     places = inspect_dataset(Dataset.open(root)).positions

@@ -140,15 +140,13 @@ def test_a_folder_of_versions_is_no_dataset(tmp_path: Path) -> None:
         Dataset.open(tmp_path / "fake")
 
 
-def test_verify_finds_altered_values(tmp_path: Path) -> None:
-    dataset = write_fake(tmp_path / "set")
+def test_verify_finds_altered_values(dataset: Dataset) -> None:
     alter(DATA, "frame_index", 9, 7)(dataset.root)
     [altered] = Dataset.open(dataset.root).verify()
     assert altered == f"frame_index: other values than were written in {DATA} rows 8 to 19 (episode 2)"
 
 
-def test_the_content_hash_sees_values_only(tmp_path: Path) -> None:
-    fake = write_fake(tmp_path / "one")
+def test_the_content_hash_sees_values_only(fake: Dataset, tmp_path: Path) -> None:
     renamed = write_fake(tmp_path / "two", task="walk", description={"name": "other", "stage": "import"})
     assert renamed.content_hash == fake.content_hash
     columns = fake_columns(7, seed=13)

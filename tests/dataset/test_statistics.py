@@ -51,8 +51,7 @@ def test_statistics_of_a_dataset_are_pooled_from_those_of_its_episodes(
     assert 0.005 < stats[STATE]["std"][1] < 0.02
 
 
-def test_episode_statistics_are_exact_to_the_precision_of_the_values(tmp_path: Path) -> None:
-    root = write_fake(tmp_path / "set").root
+def test_episode_statistics_are_exact_to_the_precision_of_the_values(root: Path) -> None:
     rows = pq.read_table(root / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
     for row, episode in zip(rows, fake_episodes(), strict=True):
         for name in NAMES:

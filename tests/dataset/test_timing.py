@@ -3,7 +3,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fake_dataset import LENGTHS, fake_episode, write_fake, writer
+from fake_dataset import LENGTHS, fake_episode, writer
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import (
@@ -24,22 +24,17 @@ from astra_data.dataset.timing import resample, trim
 TURNS = {"unit": ["m", "rad", "1", "1", "1", "1"], "role": ["invariant", "heading", *["quaternion"] * 4]}
 
 
-@pytest.fixture
-def source(tmp_path: Path) -> Dataset:
-    return write_fake(tmp_path / "fake")
-
-
 def made(path: Path) -> list[Episode]:
     return list(Dataset.open(path).episodes())
 
 
 def test_time_goes_from_both_ends_and_what_lost_its_end_is_truncated(
-    source: Dataset, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    fake: Dataset, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    found = made(trim(source, start_s=0.1, end_s=0.2, out=tmp_path / "out"))  # 2 and 4 of 20 steps a second
-    before = {episode.uid: episode for episode in source.episodes()}
+    found = made(trim(fake, start_s=0.1, end_s=0.2, out=tmp_path / "out"))  # 2 and 4 of 20 steps a second
+    before = {episode.uid: episode for episode in fake.episodes()}
     assert [len(one) for one in found] == [length - 6 for length in LENGTHS if length > 6]
-    gone = [f"{uid}" for uid, length in zip(source.uids, LENGTHS, strict=True) if length <= 6]
+    gone = [f"{uid}" for uid, length in zip(fake.uids, LENGTHS, strict=True) if length <= 6]
     assert caplog.messages == [f"nothing remains of {len(gone)} of {len(LENGTHS)} episodes: {', '.join(gone)}"]
     for one in found:
         whole = before[one.uid].columns
@@ -60,9 +55,9 @@ def test_an_episode_that_lost_its_failure_has_not_failed(tmp_path: Path) -> None
         assert one.metadata == {"failed": expected, "success": False}
 
 
-def test_an_episode_that_loses_nothing_stays_as_it_is(source: Dataset, tmp_path: Path) -> None:
-    (whole,) = [episode for episode in source.episodes() if len(episode) == 30]
-    (found,) = [one for one in made(trim(source, without="mode == 0.5", out=tmp_path / "out")) if len(one) == 30]
+def test_an_episode_that_loses_nothing_stays_as_it_is(fake: Dataset, tmp_path: Path) -> None:
+    (whole,) = [episode for episode in fake.episodes() if len(episode) == 30]
+    (found,) = [one for one in made(trim(fake, without="mode == 0.5", out=tmp_path / "out")) if len(one) == 30]
     assert found.uid == whole.uid and found.metadata == whole.metadata and not found.columns[TRUNCATED][:-1].any()
 
 
@@ -108,10 +103,10 @@ def test_still_ends_go_and_pauses_stay(tmp_path: Path) -> None:
     ],
 )
 def test_what_cannot_be_trimmed_is_told_and_nothing_written(
-    source: Dataset, tmp_path: Path, asked: dict[str, float], message: str
+    fake: Dataset, tmp_path: Path, asked: dict[str, float], message: str
 ) -> None:
     with pytest.raises(BadInputError, match=message):
-        trim(source, out=tmp_path / "out", **asked)  # type: ignore[arg-type]
+        trim(fake, out=tmp_path / "out", **asked)  # type: ignore[arg-type]
     assert not (tmp_path / "out").exists()
 
 
@@ -183,14 +178,14 @@ def test_angles_that_are_counted_go_on(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("fps", [20, 0, -5, 2001])
-def test_another_rate_is_one(source: Dataset, fps: int, tmp_path: Path) -> None:
+def test_another_rate_is_one(fake: Dataset, fps: int, tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match=f"expected another rate than 20 per second, from 1 to 2000, got {fps}"):
-        resample(source, fps, out=tmp_path / "out")
+        resample(fake, fps, out=tmp_path / "out")
 
 
-def test_a_name_that_several_columns_have_means_the_first(source: Dataset, tmp_path: Path) -> None:
-    found = made(trim(source, without="x > 0", out=tmp_path / "out"))
+def test_a_name_that_several_columns_have_means_the_first(fake: Dataset, tmp_path: Path) -> None:
+    found = made(trim(fake, without="x > 0", out=tmp_path / "out"))
     assert all((one.columns[STATE][:, 0] <= 0).all() for one in found)
-    assert sum(map(len, found)) == sum(int((one.columns[STATE][:, 0] <= 0).sum()) for one in source.episodes())
-    found = made(trim(source, without="action.x > 0", out=tmp_path / "action"))
+    assert sum(map(len, found)) == sum(int((one.columns[STATE][:, 0] <= 0).sum()) for one in fake.episodes())
+    found = made(trim(fake, without="action.x > 0", out=tmp_path / "action"))
     assert all((one.columns[ACTION][:, 0] <= 0).all() for one in found)

@@ -7,6 +7,7 @@ import pytest
 from fake_dataset import write_fake
 
 from astra_data.core.errors import BadInputError
+from astra_data.dataset import Dataset
 from astra_data.dataset.columns import Column
 from astra_data.dataset.edit import subset
 from astra_data.dataset.versions import Version, home_of, locate, names_at_home, next_version, open_dataset, successor
@@ -56,16 +57,15 @@ def test_a_missing_dataset_is_refused(home: Path, name: str, fault: str) -> None
         locate(name)
 
 
-def test_a_successor_names_its_parent_and_its_place(home: Path, tmp_path: Path) -> None:
-    source = write_fake(tmp_path / "first")
-    description, folder = successor(source.description, "episodes", stage="subset", config={"count": 2})
-    assert description["version"] == "1.1.0" and description["parents"] == [source.identity]
-    assert folder == home_of(description) == home / source.description["name"] / "data-1.1.0"
+def test_a_successor_names_its_parent_and_its_place(fake: Dataset, home: Path, tmp_path: Path) -> None:
+    description, folder = successor(fake.description, "episodes", stage="subset", config={"count": 2})
+    assert description["version"] == "1.1.0" and description["parents"] == [fake.identity]
+    assert folder == home_of(description) == home / fake.description["name"] / "data-1.1.0"
     folder.mkdir(parents=True)
-    assert successor(source.description, "episodes", stage="subset", config={})[0]["version"] == "1.2.0"
-    elsewhere = successor(source.description, "episodes", stage="filter", config={}, out=tmp_path / "here")
+    assert successor(fake.description, "episodes", stage="subset", config={})[0]["version"] == "1.2.0"
+    elsewhere = successor(fake.description, "episodes", stage="filter", config={}, out=tmp_path / "here")
     assert (elsewhere[0]["version"], elsewhere[1]) == ("1.1.0", tmp_path / "here")
-    assert open_dataset(tmp_path / "first").reference == source.reference
+    assert open_dataset(fake.root).reference == fake.reference
 
 
 def test_the_next_version_has_the_columns_of_its_source_and_more(tmp_path: Path) -> None:
@@ -88,14 +88,13 @@ def test_the_next_version_has_the_columns_of_its_source_and_more(tmp_path: Path)
     assert again.root == tmp_path / "again"
 
 
-def test_a_successor_of_another_name_begins_anew(home: Path, tmp_path: Path) -> None:
-    source = write_fake(tmp_path / "first")
+def test_a_successor_of_another_name_begins_anew(home: Path, fake: Dataset) -> None:
     asked: dict[str, Any] = {"stage": "subset", "config": {}, "name": "half"}
-    description, folder = successor(source.description, "episodes", **asked)
+    description, folder = successor(fake.description, "episodes", **asked)
     assert (description["name"], description["version"]) == ("half", "1.0.0")
-    assert description["parents"] == [source.identity]
+    assert description["parents"] == [fake.identity]
     folder.mkdir(parents=True)
-    assert successor(source.description, "episodes", **asked)[0]["version"] == "1.1.0" and names_at_home() == ["half"]
+    assert successor(fake.description, "episodes", **asked)[0]["version"] == "1.1.0" and names_at_home() == ["half"]
 
 
 def test_a_name_that_means_a_subset_says_so(home: Path, caplog: pytest.LogCaptureFixture) -> None:

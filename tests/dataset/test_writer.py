@@ -48,17 +48,16 @@ def test_the_same_episodes_give_the_same_bytes_in_every_file(tmp_path: Path) -> 
     ]
 
 
-def test_how_it_was_made_is_told_beside_the_content_hash_only(tmp_path: Path) -> None:
-    plain = write_fake(tmp_path / "plain")
+def test_how_it_was_made_is_told_beside_the_content_hash_only(fake: Dataset, tmp_path: Path) -> None:
     with writer(tmp_path / "timed") as open_writer:
         for episode in fake_episodes():
             open_writer.add(episode)
         open_writer.made = {"wall_seconds": 2.5}
     timed = Dataset.open(tmp_path / "timed")
     sums = timed.description["sums"]
-    assert timed.description == plain.description | {"wall_seconds": 2.5, "sums": sums}
-    assert {path for path in sums if sums[path] != plain.description["sums"][path]} == {DATASET_PATH}
-    before, after = contents(plain.root), contents(timed.root)
+    assert timed.description == fake.description | {"wall_seconds": 2.5, "sums": sums}
+    assert {path for path in sums if sums[path] != fake.description["sums"][path]} == {DATASET_PATH}
+    before, after = contents(fake.root), contents(timed.root)
     assert {name for name in before if before[name] != after[name]} == {"meta/astra/dataset.json"}
 
 
@@ -67,15 +66,14 @@ def test_how_it_was_made_is_told_beside_the_content_hash_only(tmp_path: Path) ->
     [(1, LENGTHS), (7, LENGTHS), (8, (8, 12, 30, 5)), (20, (20, 30, 5)), (40, (20, 35)), (2**12, (55,))],
 )
 def test_small_episodes_share_a_row_group(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, group_rows: int, lengths: tuple[int, ...]
+    fake: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, group_rows: int, lengths: tuple[int, ...]
 ) -> None:
-    alone = write_fake(tmp_path / "alone")
     monkeypatch.setattr(parquet, "GROUP_ROWS", group_rows)
     dataset = write_fake(tmp_path / "set")
     metadata = pq.read_metadata(dataset.paths[0])
     assert tuple(metadata.row_group(group).num_rows for group in range(metadata.num_row_groups)) == lengths
-    assert dataset.content_hash == alone.content_hash
-    assert pq.read_table(dataset.paths[0]).equals(pq.read_table(alone.paths[0]))
+    assert dataset.content_hash == fake.content_hash
+    assert pq.read_table(dataset.paths[0]).equals(pq.read_table(fake.paths[0]))
 
 
 def test_an_episode_may_be_altered_once_it_is_added(tmp_path: Path) -> None:
@@ -87,8 +85,8 @@ def test_an_episode_may_be_altered_once_it_is_added(tmp_path: Path) -> None:
     assert Dataset.open(tmp_path / "set").content_hash == write_fake(tmp_path / "kept").content_hash
 
 
-def test_encodings_suit_the_values(tmp_path: Path) -> None:
-    metadata = pq.read_metadata(write_fake(tmp_path / "set").paths[0])
+def test_encodings_suit_the_values(fake: Dataset) -> None:
+    metadata = pq.read_metadata(fake.paths[0])
     chunks = [metadata.row_group(0).column(index) for index in range(metadata.num_columns)]
     encodings = {chunk.path_in_schema: chunk.encodings for chunk in chunks}
     assert "BYTE_STREAM_SPLIT" in encodings["observation.state.list.element"]
@@ -97,8 +95,7 @@ def test_encodings_suit_the_values(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("lonely")
-def test_files_rotate_when_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = write_fake(tmp_path / "whole")
+def test_files_rotate_when_full(fake: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(parquet, "FILE_SIZE_LIMIT", 2_000)
     monkeypatch.setattr(parquet, "CHUNK_SIZE", 2)
     monkeypatch.setattr(episode_rows, "ROWS_AT_ONCE", 2)
@@ -106,9 +103,9 @@ def test_files_rotate_when_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     names = [str(path.relative_to(split.root)) for path in split.paths]
     assert names[:3] == [f"data/chunk-{at}.parquet" for at in ("000/file-000", "000/file-001", "001/file-000")]
     assert len(list((split.root / "meta/episodes").glob("*/*.parquet"))) == 3 and split.verify() == []
-    assert split.content_hash == whole.content_hash
-    for name in whole.features:
-        np.testing.assert_array_equal(whole.columns([name])[name], split.columns([name])[name])
+    assert split.content_hash == fake.content_hash
+    for name in fake.features:
+        np.testing.assert_array_equal(fake.columns([name])[name], split.columns([name])[name])
 
 
 @pytest.mark.parametrize("moment", ["adding", "validating", "renaming"])

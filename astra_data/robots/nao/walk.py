@@ -314,17 +314,17 @@ class WalkEngine:
         swinging[:, 0] += gait.kicking * style.kick_reach_m * np.sin(np.pi * gait.phase) ** 2
         supporting = -behind - (ahead - behind) * phase
         offset = np.stack([supporting, swinging], axis=1)
-        left = gait.left_swings.astype(np.intp)
-        offset = np.stack([offset[np.arange(len(left)), left], offset[np.arange(len(left)), 1 - left]], axis=1)
+        offset = np.where(gait.left_swings[:, None, None], offset[:, ::-1], offset)
 
         yaw, apart = offset[..., 2], np.array([HIP_OFFSET_Y_M, -HIP_OFFSET_Y_M])
         x, y = offset[..., 0], offset[..., 1] + apart
-        pose = np.zeros((len(left), 2, 6))
+        pose = np.zeros((*yaw.shape, 6))
         pose[..., 0] = np.cos(yaw) * x - np.sin(yaw) * y - style.torso_ahead_m
         pose[..., 1] = np.sin(yaw) * x + np.cos(yaw) * y - self._sway(gait)[:, None]
         pose[..., 2] = -style.hip_height_m - HIP_OFFSET_Z_M
         lifted = gait.walking & (gait.kind == STRIDE)
-        pose[np.arange(len(left)), 1 - left, 2] += lifted * style.lift_m * np.sin(np.pi * gait.phase)
+        in_air = np.where(gait.left_swings, 0, 1)
+        pose[np.arange(len(pose)), in_air, 2] += lifted * style.lift_m * np.sin(np.pi * gait.phase)
         pose[..., 5] = yaw
         return pose
 

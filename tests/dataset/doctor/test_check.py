@@ -10,10 +10,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from damaged import DATA, EPISODES, alter, declare, drop, edit, retype, truncate, write
-from fake_dataset import COLUMNS, concatenated, fake_columns, fake_episodes, write_fake, writer
+from fake_dataset import COLUMNS, concatenated, fake_columns, fake_episodes, writer
 
 from astra_data.core.errors import BadInputError, CorruptDatasetError
-from astra_data.dataset import Dataset, parquet
+from astra_data.dataset import Dataset
 from astra_data.dataset.columns import Column, Episode
 from astra_data.dataset.doctor.check import MOST, Report, check, compare_with_lerobot
 from astra_data.dataset.format import POLICY_PATH
@@ -27,14 +27,13 @@ def drop_last_row(name: str) -> Callable[[Path], None]:
     return damage
 
 
-def test_a_whole_dataset_has_no_faults(tmp_path: Path) -> None:
-    report = check(write_fake(tmp_path / "set").root)
+def test_a_whole_dataset_has_no_faults(fake: Dataset) -> None:
+    report = check(fake.root)
     assert (report.faults, report.notes) == ([], []) and (report.episodes, report.frames) == (5, 55)
 
 
-def test_a_copy_without_its_description_is_not_whole(tmp_path: Path) -> None:
+def test_a_copy_without_its_description_is_not_whole(root: Path) -> None:
     """A dataset of LeRobot's has no folder of ours, and is."""
-    root = write_fake(tmp_path / "set").root
     (root / "meta/astra/dataset.json").unlink()
     assert [str(fault) for fault in check(root).faults] == [
         "meta/astra/dataset.json is missing: the dataset is incomplete; copy it again"
@@ -84,8 +83,7 @@ def test_a_copy_without_its_description_is_not_whole(tmp_path: Path) -> None:
         (declare("action", names=["x"]), ["action: 1 names for 2 values"]),
     ],
 )
-def test_damage_is_found(tmp_path: Path, damage: Callable[[Path], object], parts: list[str]) -> None:
-    root = write_fake(tmp_path / "set").root
+def test_damage_is_found(root: Path, damage: Callable[[Path], object], parts: list[str]) -> None:
     damage(root)
     faults = "\n".join(check(root).faults)
     for part in parts:
@@ -109,8 +107,7 @@ def test_damage_is_found(tmp_path: Path, damage: Callable[[Path], object], parts
         ),
     ],
 )
-def test_what_was_altered_is_named(tmp_path: Path, damage: Callable[[Path], object], faults: str) -> None:
-    root = write_fake(tmp_path / "set").root
+def test_what_was_altered_is_named(root: Path, damage: Callable[[Path], object], faults: str) -> None:
     damage(root)
     assert faults in check(root).faults
     # Nothing else is named so.
@@ -151,8 +148,7 @@ def test_all_faults_are_told_but_few_of_a_kind(tmp_path: Path) -> None:
     assert report.fault_count == 36
 
 
-def test_columns_that_differ_from_the_declared_are_told(tmp_path: Path) -> None:
-    root = write_fake(tmp_path / "set").root
+def test_columns_that_differ_from_the_declared_are_told(root: Path) -> None:
     table = pq.read_table(root / DATA)
     table = table.drop_columns(["action"]).append_column("extra", table.column("mode"))
     at = table.column_names.index("next.reward")
@@ -162,10 +158,8 @@ def test_columns_that_differ_from_the_declared_are_told(tmp_path: Path) -> None:
         assert part in faults
 
 
-@pytest.mark.usefixtures("lonely")
-def test_a_missing_file_is_named_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parquet, "FILE_SIZE_LIMIT", 500)  # a file for each episode
-    root = write_fake(tmp_path / "set").root
+@pytest.mark.usefixtures("scattered")
+def test_a_missing_file_is_named_alone(root: Path) -> None:
     name = DATA.replace("file-000", "file-002")
     drop(name)(root)
     assert check(root).faults == [f"{name} is missing"]
@@ -175,8 +169,7 @@ def test_a_missing_file_is_named_alone(tmp_path: Path, monkeypatch: pytest.Monke
         Dataset.open(root)
 
 
-def test_a_plain_dataset_is_checked_without_our_metadata(tmp_path: Path) -> None:
-    root = write_fake(tmp_path / "set").root
+def test_a_plain_dataset_is_checked_without_our_metadata(root: Path) -> None:
     for path in (root / "meta/astra").iterdir():
         path.unlink()
     (root / "meta/other.json").write_text("{}")
@@ -192,9 +185,8 @@ def test_a_plain_dataset_is_checked_without_our_metadata(tmp_path: Path) -> None
 
 
 @pytest.fixture
-def plain(tmp_path: Path) -> Path:
+def plain(root: Path) -> Path:
     """A dataset without our metadata."""
-    root = write_fake(tmp_path / "set").root
     shutil.rmtree(root / "meta/astra")
     return root
 

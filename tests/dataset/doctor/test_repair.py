@@ -26,6 +26,12 @@ def killed(recorded: Path) -> Path:
     return recorded / "killed"
 
 
+@pytest.fixture
+def whole(tmp_path: Path) -> Dataset:
+    """A fake dataset whose subsets are of a seed of their own."""
+    return write_fake(tmp_path / "set", subset_seed=7)
+
+
 def assert_saved(root: Path, episodes: int) -> None:
     saved = Dataset.open(root)
     assert saved.verify() == [] and check(root).faults == [] and saved.uids.tolist() == list(range(episodes))
@@ -90,8 +96,7 @@ def test_of_a_file_that_was_cut_the_whole_row_groups_are_recovered(killed: Path,
     assert_saved(tmp_path / "saved", repaired.episodes)
 
 
-def test_episodes_with_wrong_values_are_left_out(tmp_path: Path) -> None:
-    root = write_fake(tmp_path / "set").root
+def test_episodes_with_wrong_values_are_left_out(root: Path, tmp_path: Path) -> None:
     alter_rows(root / DATA, "next.reward", {25: float("nan")})
     alter_rows(root / DATA, "next.done", {3: True})
     (root / EPISODES).unlink()
@@ -109,8 +114,7 @@ def test_episodes_with_wrong_values_are_left_out(tmp_path: Path) -> None:
     assert_same(saved.episodes(), whole)
 
 
-def test_only_the_first_episode_of_a_uid_is_saved(tmp_path: Path) -> None:
-    root = write_fake(tmp_path / "set").root
+def test_only_the_first_episode_of_a_uid_is_saved(root: Path, tmp_path: Path) -> None:
     drop(DIGESTS_PATH)(root)
     alter_rows(root / DATA, "episode_uid", dict.fromkeys(range(8, 20), 4))
     repaired = repair(root, out=tmp_path / "saved")
@@ -198,8 +202,7 @@ def test_tasks_are_known_by_their_index(killed: Path, tmp_path: Path) -> None:
     assert saved.task == "walk / run"
 
 
-def test_an_episode_that_may_have_been_cut_is_left_out(tmp_path: Path) -> None:
-    root = write_fake(tmp_path / "set").root
+def test_an_episode_that_may_have_been_cut_is_left_out(root: Path, tmp_path: Path) -> None:
     table = pq.read_table(root / DATA)
     pq.write_table(table, root / DATA, row_group_size=20)
     truncate(DATA)(root)
@@ -209,22 +212,21 @@ def test_an_episode_that_may_have_been_cut_is_left_out(tmp_path: Path) -> None:
     assert f"left out rows 50 to 54 of {DATA}: they may be part of an episode" in repaired.notes
 
 
-def test_metadata_is_joined_by_uid(tmp_path: Path) -> None:
-    original = write_fake(tmp_path / "original", subset_seed=7)
-    edited = shutil.copytree(original.root, tmp_path / "edited", ignore=shutil.ignore_patterns("astra"))
+def test_metadata_is_joined_by_uid(whole: Dataset, tmp_path: Path) -> None:
+    edited = shutil.copytree(whole.root, tmp_path / "edited", ignore=shutil.ignore_patterns("astra"))
     repair(edited, out=tmp_path / "alone")
     assert Dataset.open(tmp_path / "alone").metadata == Dataset.open(edited).metadata  # of LeRobot: with next states
     alone, before = (Dataset.open(at).columns([NEXT_STATE])[NEXT_STATE] for at in (tmp_path / "alone", edited))
     np.testing.assert_array_equal(alone, before)
-    repair(edited, out=tmp_path / "joined", like=original)
+    repair(edited, out=tmp_path / "joined", like=whole)
     joined = Dataset.open(tmp_path / "joined")
-    assert (joined.metadata, joined.order) == (original.metadata, original.order)
+    assert (joined.metadata, joined.order) == (whole.metadata, whole.order)
     assert joined.description["environment"] == {"id": "Fake-v0"}
-    assert joined.description["parents"] == [original.identity] and joined.reference == "fake@data-1.1.0"
+    assert joined.description["parents"] == [whole.identity] and joined.reference == "fake@data-1.1.0"
     other = write_fake(tmp_path / "other", description={**DESCRIPTION, "name": "other"})
-    repair(edited, out=tmp_path / "merged", like=[original, other])
+    repair(edited, out=tmp_path / "merged", like=[whole, other])
     merged = Dataset.open(tmp_path / "merged")
-    assert merged.description["parents"] == [original.identity, other.identity]
+    assert merged.description["parents"] == [whole.identity, other.identity]
 
 
 def test_lists_without_a_size_are_read_as_lerobots_merge_writes_them(tmp_path: Path) -> None:
@@ -243,8 +245,7 @@ def test_lists_without_a_size_are_read_as_lerobots_merge_writes_them(tmp_path: P
     assert check(root).faults == ["action: expected 2 values in every row"]
 
 
-def test_what_cannot_be_repaired_is_told_and_nothing_is_written(tmp_path: Path) -> None:
-    root = write_fake(tmp_path / "set").root
+def test_what_cannot_be_repaired_is_told_and_nothing_is_written(root: Path, tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="exists already"):
         repair(root, out=root)
     (root / DATA).write_bytes(b"PAR1 rubbish" * 50)
@@ -259,8 +260,7 @@ def test_what_cannot_be_repaired_is_told_and_nothing_is_written(tmp_path: Path) 
     assert [path.name for path in tmp_path.iterdir()] == ["set"]
 
 
-def test_an_altered_value_is_told_though_it_cannot_be_found(tmp_path: Path) -> None:
-    root = write_fake(tmp_path / "set").root
+def test_an_altered_value_is_told_though_it_cannot_be_found(root: Path, tmp_path: Path) -> None:
     edit(DATASET_PATH, content_hash="0" * 64)(root)
     reseal(root)
     drop(DIGESTS_PATH)(root)
@@ -269,8 +269,7 @@ def test_an_altered_value_is_told_though_it_cannot_be_found(tmp_path: Path) -> N
     assert Dataset.open(tmp_path / "out").description["repaired"] == result.notes
 
 
-def test_episodes_with_other_values_than_were_written_are_left_out(tmp_path: Path) -> None:
-    whole = write_fake(tmp_path / "set", subset_seed=7)
+def test_episodes_with_other_values_than_were_written_are_left_out(whole: Dataset, tmp_path: Path) -> None:
     alter_rows(whole.root / DATA, "next.reward", {25: 9.0})
     alter_rows(whole.root / DATA, "frame_index", {9: 7})  # a wrong structure costs no later episode either
     repaired = repair(whole.root, out=tmp_path / "saved")
@@ -297,8 +296,9 @@ def test_episodes_with_other_values_than_were_written_are_left_out(tmp_path: Pat
         ("observation.state", {"dtype": "float32", "shape": [3], "names": None, "astra": "m"}),
     ],
 )
-def test_columns_are_what_is_stored_whatever_info_says(tmp_path: Path, name: str, feature: object) -> None:
-    whole = write_fake(tmp_path / "set")
+def test_columns_are_what_is_stored_whatever_info_says(
+    whole: Dataset, tmp_path: Path, name: str, feature: object
+) -> None:
     features = json.loads((whole.root / INFO_PATH).read_text())["features"]
     changed = {key: one for key, one in (features | {name: feature}).items() if key != "mode" or name != "mode"}
     edit(INFO_PATH, features=changed)(whole.root)
@@ -323,20 +323,19 @@ def test_altered_metadata_is_not_taken_over(tmp_path: Path) -> None:
     assert (saved.metadata, saved.subset_seed) == ({}, 0)
 
 
-def test_episodes_with_other_values_than_the_original_are_left_out(tmp_path: Path) -> None:
-    original = write_fake(tmp_path / "original")
-    edited = shutil.copytree(original.root, tmp_path / "edited", ignore=shutil.ignore_patterns("astra"))
+def test_episodes_with_other_values_than_the_original_are_left_out(fake: Dataset, tmp_path: Path) -> None:
+    edited = shutil.copytree(fake.root, tmp_path / "edited", ignore=shutil.ignore_patterns("astra"))
     alter_rows(edited / DATA, REWARD, {0: 9.0})
-    uid, *others = original.uids.tolist()
-    repaired = repair(edited, out=tmp_path / "joined", like=original)
-    assert f"left out the episode of uid {uid}: its values are not those in {original.reference}" in repaired.notes
+    uid, *others = fake.uids.tolist()
+    repaired = repair(edited, out=tmp_path / "joined", like=fake)
+    assert f"left out the episode of uid {uid}: its values are not those in {fake.reference}" in repaired.notes
     joined = Dataset.open(tmp_path / "joined")
     assert joined.uids.tolist() == others
-    assert joined.metadata == {key: values[1:] for key, values in original.metadata.items()}
+    assert joined.metadata == {key: values[1:] for key, values in fake.metadata.items()}
     # In a merge it may be another dataset's, whose uids were the same.
-    repair(edited, out=tmp_path / "merged", like=original, new_uids=True)
+    repair(edited, out=tmp_path / "merged", like=fake, new_uids=True)
     merged = Dataset.open(tmp_path / "merged")
-    assert merged.metadata == {key: [None, *values[1:]] for key, values in original.metadata.items()}
+    assert merged.metadata == {key: [None, *values[1:]] for key, values in fake.metadata.items()}
 
 
 def stored(*datasets: Dataset) -> list[tuple[int, dict[str, Array]]]:
@@ -352,8 +351,7 @@ def other(tmp_path: Path) -> Dataset:
     return Dataset.open(tmp_path / "other")
 
 
-def test_each_has_the_metadata_of_its_own_dataset(tmp_path: Path, other: Dataset) -> None:
-    fake = write_fake(tmp_path / "set")
+def test_each_has_the_metadata_of_its_own_dataset(fake: Dataset, other: Dataset) -> None:
     joined = join(stored(other, fake), COLUMNS, [fake, other])
     # The fake dataset's episode 4 comes later, and is the one with a new uid.
     assert [episode.uid for episode in joined[:3]] == [4, 99, 13] and joined[0].metadata == {"floor": "carpet"}
@@ -361,14 +359,12 @@ def test_each_has_the_metadata_of_its_own_dataset(tmp_path: Path, other: Dataset
     assert joined[3].metadata["merged_uid"] == 4 and all(episode.is_known for episode in joined)
 
 
-def test_sources_of_copies_follow_their_new_uids(tmp_path: Path, other: Dataset) -> None:
-    fake = write_fake(tmp_path / "set")
+def test_sources_of_copies_follow_their_new_uids(fake: Dataset, other: Dataset) -> None:
     joined = join(stored(fake, other), COLUMNS, [fake, other])
     assert joined[-1].metadata == {"source_episode": joined[-2].uid} and joined[-2].uid != 4
 
 
-def test_the_same_episode_again_has_another_uid_the_same_in_every_run(tmp_path: Path) -> None:
-    fake = write_fake(tmp_path / "set")
+def test_the_same_episode_again_has_another_uid_the_same_in_every_run(fake: Dataset) -> None:
     first, again = (join(stored(fake, fake, fake), COLUMNS, [fake]) for _ in range(2))
     uids = [episode.uid for episode in first]
     assert len(set(uids)) == 3 * len(fake) and min(uids) >= 0 and max(uids) < 2**63
@@ -379,11 +375,6 @@ INFO, TASKS = INFO_PATH, "meta/tasks.parquet"
 SEED_0 = "the order of the subsets is that of seed 0"
 WAS = "was altered after it was written"
 LOST = "success, return and the like of the episodes are lost"
-
-
-@pytest.fixture
-def whole(tmp_path: Path) -> Dataset:
-    return write_fake(tmp_path / "set", subset_seed=7)
 
 
 def seen(root: Path, *sources: Dataset) -> tuple[Remains, list[str]]:

@@ -8,7 +8,7 @@ import pytest
 from damaged import DATA, EPISODES, alter, drop, retype
 from fake_dataset import fake_episodes, write_fake
 
-from astra_data.dataset import parquet
+from astra_data.dataset import Dataset, parquet
 from astra_data.dataset.columns import STATE
 from astra_data.dataset.description import Digests, read_digests
 from astra_data.dataset.doctor.salvage import rebuilt_metadata, whole_runs
@@ -45,15 +45,13 @@ def salvaged(root: Path, digests: Digests | None = None) -> tuple[list[int], lis
         (drop(EPISODES), [0, 1, 2, 3, 4], "meta/episodes was missing and was rebuilt from the data"),
     ],
 )
-def test_what_is_intact_is_read(tmp_path: Path, damage: Callable[[Path], object], left: list[int], note: str) -> None:
-    root = write_fake(tmp_path / "set").root
+def test_what_is_intact_is_read(root: Path, damage: Callable[[Path], object], left: list[int], note: str) -> None:
     damage(root)
     uids, notes = salvaged(root)
     assert uids == [UIDS[index] for index in left] and len(notes) == 1 and note in notes[0]
 
 
-def test_a_number_that_is_missing_costs_its_row_group(tmp_path: Path) -> None:
-    root = write_fake(tmp_path / "set").root
+def test_a_number_that_is_missing_costs_its_row_group(root: Path) -> None:
     alter(DATA, "action", 9, None)(root)
     uids, notes = salvaged(root)
     assert uids == UIDS[-2:] and "rows 0 to 9 cannot be read (action: expected 2 values" in notes[0]
@@ -62,8 +60,7 @@ def test_a_number_that_is_missing_costs_its_row_group(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "damage", [alter(DATA, "index", 9, 70), alter(DATA, "action", 9, [0.5, 0]), alter(DATA, "mode", 19, 3)]
 )
-def test_with_digests_an_altered_episode_costs_no_other(tmp_path: Path, damage: Callable[[Path], object]) -> None:
-    dataset = write_fake(tmp_path / "set")
+def test_with_digests_an_altered_episode_costs_no_other(dataset: Dataset, damage: Callable[[Path], object]) -> None:
     digests = read_digests(dataset.root, dataset.features)
     damage(dataset.root)
     uids, [note] = salvaged(dataset.root, digests)
@@ -71,8 +68,7 @@ def test_with_digests_an_altered_episode_costs_no_other(tmp_path: Path, damage: 
     assert f"other values than were written in {DATA} rows 8 to 19 (episode 2)" in note
 
 
-def test_an_altered_length_costs_no_episode_whose_digests_agree(tmp_path: Path) -> None:
-    dataset = write_fake(tmp_path / "set")
+def test_an_altered_length_costs_no_episode_whose_digests_agree(dataset: Dataset) -> None:
     alter(EPISODES, "length", 2, 11)(dataset.root)
     assert salvaged(dataset.root, read_digests(dataset.root, dataset.features)) == (UIDS, [])
 
@@ -136,17 +132,15 @@ def test_of_a_shared_row_group_before_the_end_of_a_cut_file_every_episode_is_rec
     ],
 )
 def test_episodes_with_rows_in_an_unreadable_row_group_are_left_out(
-    tmp_path: Path, size: int, group: int, left: list[int]
+    root: Path, size: int, group: int, left: list[int]
 ) -> None:
-    root = write_fake(tmp_path / "set").root
     pq.write_table(pq.read_table(root / DATA), root / DATA, row_group_size=size)
     deface(root / DATA, group, "index")
     assert salvaged(root)[0] == [UIDS[index] for index in left]
 
 
 @pytest.mark.usefixtures("lonely")
-def test_without_meta_episodes_the_rows_tell_which_episode_follows(tmp_path: Path) -> None:
-    root = write_fake(tmp_path / "set").root
+def test_without_meta_episodes_the_rows_tell_which_episode_follows(root: Path) -> None:
     drop(EPISODES)(root)
     deface(root / DATA, 1, "action")
     uids, notes = salvaged(root)
@@ -154,10 +148,8 @@ def test_without_meta_episodes_the_rows_tell_which_episode_follows(tmp_path: Pat
     assert uids == UIDS[2:] and notes[-1] == "left out episodes 0 to 1: rows that belong there cannot be read"
 
 
-@pytest.mark.usefixtures("lonely")
-def test_a_file_that_comes_twice_costs_no_episode(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parquet, "FILE_SIZE_LIMIT", 500)  # a file for each episode
-    root = write_fake(tmp_path / "set").root
+@pytest.mark.usefixtures("scattered")
+def test_a_file_that_comes_twice_costs_no_episode(root: Path) -> None:
     (root / DATA.replace("file-000", "file-002a")).write_bytes(
         (root / DATA.replace("file-000", "file-001")).read_bytes()
     )
@@ -166,14 +158,10 @@ def test_a_file_that_comes_twice_costs_no_episode(tmp_path: Path, monkeypatch: p
     assert note == "left out rows 0 to 0 of data/chunk-000/file-002a.parquet: they are of episode 1 once more"
 
 
-@pytest.mark.usefixtures("lonely")
+@pytest.mark.usefixtures("scattered")
 @pytest.mark.parametrize("has_places", [True, False])
 @pytest.mark.parametrize("damage", ["defaced", "rubbish", "without a column", "missing"])
-def test_a_lost_file_costs_its_episodes_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, damage: str, *, has_places: bool
-) -> None:
-    monkeypatch.setattr(parquet, "FILE_SIZE_LIMIT", 500)  # a file for each episode
-    root = write_fake(tmp_path / "set").root
+def test_a_lost_file_costs_its_episodes_alone(root: Path, damage: str, *, has_places: bool) -> None:
     if not has_places:
         drop(EPISODES)(root)
     names = [DATA.replace("file-000", f"file-00{file}") for file in (1, 2)]

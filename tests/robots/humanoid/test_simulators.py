@@ -20,7 +20,6 @@ from astra_data.robots.humanoid.target import (
 )
 from astra_data.robots.humanoid.tasks import (
     HumanoidExtendedKinematics,
-    HumanoidKinematics,
     HumanoidWalker2d,
     sole_clearance,
     walker_model,
@@ -157,28 +156,6 @@ def test_a_correction_says_what_touches_as_the_humanoids_feet_do() -> None:
     settled = walker.settle(walker.state, landed)
     assert torch.equal(settled[:, :13], landed[:, :13])
     assert settled[:, 13:].tolist() == [[0.0, 0.0], [1.0, 1.0], [0.0, 1.0]] and torch.equal(walker.state, settled)
-
-
-KINDS = (HumanoidKinematics, HumanoidExtendedKinematics)
-Kind = type[HumanoidKinematics]
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_joints_approach_their_targets(kind: Kind) -> None:
-    simulator = kind(1)
-    action = torch.tensor([[-0.5, -0.2, 0.7, 9.0]])
-    for _ in range(7):
-        state = simulator.step(action)[0]
-    targets = commanded_angles(action[0])
-    time_s = 7 * 0.015
-    # Gains 200 and 10; hips are damped by 5, knees by 1.
-    for joint, target, damping in zip(COMMANDED, targets.tolist(), [5.0, 1.0, 5.0, 1.0], strict=True):
-        rate = 200 / (10 + damping)
-        left = math.exp(-rate * time_s)
-        assert float(state[joint]) == pytest.approx(target * (1 - left), abs=1e-5)
-        assert float(state[17 + joint]) == pytest.approx(target * rate * left, abs=1e-4)
-    others = [joint for joint in range(17) if joint not in COMMANDED]
-    assert not state[others].any()
 
 
 def level(angles: Floats) -> tuple[Floats, Floats]:

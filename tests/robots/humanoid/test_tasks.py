@@ -170,16 +170,22 @@ def test_commands_are_scaled_as_far_as_there_is_room(kind: Kind) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS[1:])
-def test_friction_and_timestep_change_how_far_joints_get(kind: Kind) -> None:
-    state = kind(1).state.repeat(2, 1)
-    simulator = varied(kind, state, JointVariation(friction=(2.0, 2.0), timestep_scale=(1.5, 1.5)))
-    landed = simulator.step(ACTION.expand(2, 4))[0]
-    targets = humanoid.commanded_angles(ACTION[0]).tolist()
+@pytest.mark.parametrize(("friction", "scale"), [(1.0, 1.0), (2.0, 1.5)])
+def test_joints_approach_their_targets(kind: Kind, friction: float, scale: float) -> None:
+    variation = JointVariation(friction=(friction, friction), timestep_scale=(scale, scale))
+    simulator = varied(kind, kind(1).state, variation)
+    action = torch.tensor([[-0.5, -0.2, 0.7, 9.0]])
+    for _ in range(7):
+        landed = simulator.step(action)[0]
+    targets = humanoid.commanded_angles(action[0]).tolist()
+    # Gains 200 and 10; hips are damped by 5, knees by 1.
     for joint, target, damping in zip(humanoid.COMMANDED, targets, [5.0, 1.0, 5.0, 1.0], strict=True):
-        rate = 200 / (10 + 2 * damping)
-        left = math.exp(-rate * 1.5 * 0.015)
+        rate = 200 / (10 + friction * damping)
+        left = math.exp(-rate * 7 * scale * 0.015)
         assert float(landed[joint]) == pytest.approx(target * (1 - left), abs=1e-5)
         assert float(landed[17 + joint]) == pytest.approx(target * rate * left, abs=1e-4)
+    others = [joint for joint in range(17) if joint not in humanoid.COMMANDED]
+    assert not landed[others].any()
 
 
 def test_walkers_have_the_damping_and_the_time_that_they_were_given() -> None:

@@ -56,10 +56,11 @@ def test_each_trait_has_its_own_range() -> None:
 
 
 LIMITS = walk.WalkLimits()
+STYLE = walk.WalkStyle(step_scale=(1.0, 1.0, 1.0))
 
 
-def planner(*quality: float) -> walk.WalkEngine:
-    return walk.WalkEngine(np.array(quality), LIMITS, walk.WalkStyle())
+def engine(quality: float = 1.0) -> walk.WalkEngine:
+    return walk.WalkEngine(np.array([quality]), LIMITS, STYLE)
 
 
 def one(*command: float) -> Floats:
@@ -71,7 +72,7 @@ def strides(command: Floats, seconds: float, gait: walk.Gait | None = None) -> l
     gait = gait or walk.Gait.standing(1, LIMITS)
     seen = []
     for _ in range(round(seconds / walk.TICK_S)):
-        begins = planner(1.0).tick(gait, command)
+        begins = engine().tick(gait, command)
         if begins[0] and gait.kind[0] == walk.STRIDE:
             seen.append(walk.Gait(**{name: value.copy() for name, value in vars(gait).items()}))
     return seen
@@ -95,8 +96,8 @@ def strides(command: Floats, seconds: float, gait: walk.Gait | None = None) -> l
     ],
 )
 def test_attainable_speeds(command: tuple[float, ...], attained: tuple[float, ...]) -> None:
-    np.testing.assert_allclose(planner(1.0).attainable(one(*command)), [attained], atol=1e-12)
-    worn = planner(0.5).attainable(np.array([[0.9, 0, 0], [0, -0.9, 0], [0, 0, -9.0]]))
+    np.testing.assert_allclose(engine().attainable(one(*command)), [attained], atol=1e-12)
+    worn = engine(0.5).attainable(np.array([[0.9, 0, 0], [0, -0.9, 0], [0, 0, -9.0]]))
     np.testing.assert_allclose(worn, np.diag([0.125, -0.1, -np.radians(60)]), atol=1e-12)
 
 
@@ -132,17 +133,10 @@ def test_walking_begins_and_ends_with_a_shift_of_weight() -> None:
     gait, kinds = walk.Gait.standing(1, LIMITS), []
     for tick in range(200):
         command = one(0.1, 0, 0) if tick < 100 else one(0, 0, 0)
-        if planner(1.0).tick(gait, command)[0]:
+        if engine().tick(gait, command)[0]:
             kinds.append(int(gait.kind[0]))
     assert kinds[0] == walk.START and kinds[-1] == walk.STOP and set(kinds[1:-1]) == {walk.STRIDE}
     assert not gait.walking[0] and (gait.after == 0).all()
-
-
-STYLE = walk.WalkStyle(step_scale=(1.0, 1.0, 1.0))
-
-
-def engine(count: int = 1, style: walk.WalkStyle = STYLE) -> walk.WalkEngine:
-    return walk.WalkEngine(np.ones(count), LIMITS, style)
 
 
 def striding(**changes: object) -> walk.Gait:
@@ -195,7 +189,7 @@ def test_the_torso_sways_as_a_pendulum_on_the_supporting_foot() -> None:
 
 
 def test_targets_are_the_angles_of_the_planned_feet_tick_by_tick() -> None:
-    command = np.array([[0.2, 0.0, 0.0]])
+    command = one(0.2, 0.0, 0.0)
     walking, again = walk.Gait.standing(1, LIMITS), walk.Gait.standing(1, LIMITS)
     targets = engine().advance(walking, command, 40)
     assert targets.angles.shape == (1, 40, 11) and len(targets.gaits) == 41
