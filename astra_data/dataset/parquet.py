@@ -114,14 +114,14 @@ class RotatingWriter:
         compression: str = "snappy",  # as LeRobot's; zstd is smaller, and slower
     ) -> None:
         """Start the first file; `pattern` names the files, `encodings` those of their columns."""
-        self.chunk_index = self.file_index = 0
+        self._number = 0  # of the file
         self._root, self._pattern, self._schema = root, pattern, schema
         self._encodings, self._compression = encodings, compression
         self._open()
 
     def _open(self) -> None:
-        name = self._pattern.format(chunk_index=self.chunk_index, file_index=self.file_index)
-        path = self._root / name
+        chunk, file = divmod(self._number, CHUNK_SIZE)
+        path = self._root / self._pattern.format(chunk_index=chunk, file_index=file)
         path.parent.mkdir(parents=True, exist_ok=True)
         self._file = path.open("wb")
         self._writer = pq.ParquetWriter(
@@ -136,11 +136,9 @@ class RotatingWriter:
         """Return (chunk_index, file_index) of the next row group, starting a new file if this one is full."""
         if self._file.tell() >= FILE_SIZE_LIMIT:
             self.close()
-            self.file_index += 1
-            if self.file_index == CHUNK_SIZE:
-                self.chunk_index, self.file_index = self.chunk_index + 1, 0
+            self._number += 1
             self._open()
-        return self.chunk_index, self.file_index
+        return divmod(self._number, CHUNK_SIZE)
 
     def write(self, table: pa.Table) -> None:
         """Append `table` as one row group; call `locate` first."""

@@ -219,9 +219,9 @@ class BatchedNao:
         """Restart the noise of the sensors at `seed`."""
         self._seed, self._steps = seed, 0
 
-    def _kicking_feet(self, kick: Bools | None) -> Bools | None:
+    def _kicking_feet(self, kick: Bools | None) -> Bools:
         if kick is None or not self.has_ball:
-            return None
+            return np.zeros((self.num_robots, 2), dtype=bool)
         x, y = (self.ball - self.pose[:, :2]).T
         yaw = self.pose[:, 2]
         to_the_left = np.cos(yaw) * y - np.sin(yaw) * x

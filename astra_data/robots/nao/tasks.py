@@ -49,15 +49,14 @@ class Localisation:
 
     def __init__(self, num_robots: int, errors: PerceptionErrors, step_s: float) -> None:
         self.errors, self.step_s = errors, step_s
+        self._spread = np.array([errors.drift_m, errors.drift_m, errors.drift_rad])
         self.pose: Floats = np.zeros((num_robots, 3))
         self._drift: Floats = np.zeros((num_robots, 3))
         self._true: Floats = np.zeros((num_robots, 3))
 
     def reset(self, rows: NDArray[np.intp], pose: Floats, rng: np.random.Generator) -> None:
         """Restart `rows` (n,) at the true `pose` (n, 3), with an error of the usual size."""
-        errors = self.errors
-        spread = np.array([errors.drift_m, errors.drift_m, errors.drift_rad])
-        self._drift[rows] = spread * rng.normal(size=(len(rows), 3))
+        self._drift[rows] = self._spread * rng.normal(size=(len(rows), 3))
         self._true[rows] = pose
         self.pose[rows] = pose + self._drift[rows]
 
@@ -65,8 +64,7 @@ class Localisation:
         """Update the estimates of the robots in `active` (B,) after a step to the true `pose` (B, 3)."""
         errors, count = self.errors, len(pose)
         keep = np.exp(-self.step_s / errors.drift_s)
-        spread = np.array([errors.drift_m, errors.drift_m, errors.drift_rad])
-        drift = keep * self._drift + np.sqrt(1 - keep**2) * spread * rng.normal(size=(count, 3))
+        drift = keep * self._drift + np.sqrt(1 - keep**2) * self._spread * rng.normal(size=(count, 3))
         jumps = rng.random(count) < errors.jumps_per_s * self.step_s
         way = rng.uniform(*errors.jump_m, count) * jumps
         angle = rng.uniform(-np.pi, np.pi, count)

@@ -250,12 +250,10 @@ class WalkEngine:
         x, y = x / excess, y / excess
         return np.stack([x, y, turn], axis=1)
 
-    def tick(self, gait: Gait, command: Floats, on_the_spot: Bools | None = None) -> Bools:
-        """Advance `gait` in place, planning steps by `command` (B, 3), zero for rest; return which began one, (B,)."""
+    def tick(self, gait: Gait, command: Floats, on_the_spot: Bools) -> Bools:
+        """Advance `gait`, planning steps by `command` (B, 3), none for zero but `on_the_spot`; return who began one."""
         gait.phase = np.where(gait.walking, gait.phase + TICK_S / gait.duration_s, 0.0)
-        called = (command != 0).any(axis=1)
-        if on_the_spot is not None:
-            called |= on_the_spot
+        called = (command != 0).any(axis=1) | on_the_spot
         landed = gait.walking & (gait.phase >= 1)
         rests = landed & ~called & (gait.kind == STOP)
         begins = (landed & ~rests) | (~gait.walking & called)
@@ -286,11 +284,9 @@ class WalkEngine:
         gait.duration_s = np.where(begins, duration, gait.duration_s)
         gait.forward_m_s = np.where(begins, x * (kind == STRIDE), gait.forward_m_s)
 
-    def advance(self, gait: Gait, command: Floats, ticks: int, kick: Bools | None = None) -> Targets:
+    def advance(self, gait: Gait, command: Floats, ticks: int, kick: Bools) -> Targets:
         """Walk on at `command` (B, 3) for `ticks`, changing `gait`; feet that are to `kick` (B, 2) do in a swing."""
         feet, supports, lifts_off, gaits = [], [], [], [replace(gait)]
-        if kick is None:
-            kick = np.zeros((len(command), 2), dtype=bool)
         steps_on = np.asarray(kick.any(axis=1))
         for _ in range(ticks):
             begins = self.tick(gait, command, steps_on)

@@ -56,6 +56,7 @@ def test_each_trait_has_its_own_range() -> None:
 
 
 LIMITS = walk.WalkLimits()
+NOBODY = np.zeros(1, bool)
 STYLE = walk.WalkStyle(step_scale=(1.0, 1.0, 1.0))
 
 
@@ -72,7 +73,7 @@ def strides(command: Floats, seconds: float, gait: walk.Gait | None = None) -> l
     gait = gait or walk.Gait.standing(1, LIMITS)
     seen = []
     for _ in range(round(seconds / walk.TICK_S)):
-        begins = engine().tick(gait, command)
+        begins = engine().tick(gait, command, NOBODY)
         if begins[0] and gait.kind[0] == walk.STRIDE:
             seen.append(walk.Gait(**{name: value.copy() for name, value in vars(gait).items()}))
     return seen
@@ -133,7 +134,7 @@ def test_walking_begins_and_ends_with_a_shift_of_weight() -> None:
     gait, kinds = walk.Gait.standing(1, LIMITS), []
     for tick in range(200):
         command = one(0.1, 0, 0) if tick < 100 else one(0, 0, 0)
-        if engine().tick(gait, command)[0]:
+        if engine().tick(gait, command, NOBODY)[0]:
             kinds.append(int(gait.kind[0]))
     assert kinds[0] == walk.START and kinds[-1] == walk.STOP and set(kinds[1:-1]) == {walk.STRIDE}
     assert not gait.walking[0] and (gait.after == 0).all()
@@ -191,10 +192,10 @@ def test_the_torso_sways_as_a_pendulum_on_the_supporting_foot() -> None:
 def test_targets_are_the_angles_of_the_planned_feet_tick_by_tick() -> None:
     command = one(0.2, 0.0, 0.0)
     walking, again = walk.Gait.standing(1, LIMITS), walk.Gait.standing(1, LIMITS)
-    targets = engine().advance(walking, command, 40)
+    targets = engine().advance(walking, command, 40, np.zeros((1, 2), bool))
     assert targets.angles.shape == (1, 40, 11) and len(targets.gaits) == 41
     for tick in range(40):
-        engine().tick(again, command)
+        engine().tick(again, command, NOBODY)
         np.testing.assert_allclose(
             foot_poses(targets.angles[0, tick])[:, :5], engine().feet(again)[0][:, :5], atol=1e-9
         )
