@@ -1,13 +1,13 @@
 """Runs in the test's own process, and fits of a few updates, where what they learn does not matter."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 
-from astra_data.core.progress import silent
 from astra_data.grounding.descent import DescentConfig
 from astra_data.pipeline.experiment import load_experiment
-from astra_data.pipeline.plan import plan, stages_until
+from astra_data.pipeline.plan import Selection, plan, stages_until
 
 
 def small_tables(*, held_out_share: float, episodes: int, train: str = "") -> str:
@@ -36,17 +36,18 @@ episodes = {episodes}
 """
 
 
-def run_here(path: Path, until: str | None = None, device: str = "cpu") -> Path:
-    """Run a recipe in this process, to `runs` beside it; return its folder.
+def run_here(path: Path, until: str | None = None, device: str = "cpu", seeds: Sequence[int] = ()) -> Path:
+    """Run a recipe, by default all of its seeds, in this process, to `runs` beside it; return its folder.
 
     A process of its own takes seconds to load what this one has loaded.
     """
     experiment, stages = load_experiment(path, path.parent / "runs"), stages_until(until)
     experiment.folder.mkdir(parents=True)
     (experiment.folder / "recipe.json").write_text(experiment.recipe.model_dump_json())
-    for item in plan(experiment.recipe, path, experiment.folder, device=device):
+    part = Selection.of(experiment.recipe, seeds=seeds)
+    for item in plan(experiment.recipe, path, experiment.folder, part, device=device):
         if item.stage in stages:
-            item.call(progress=silent)
+            item.call()
     return experiment.folder
 
 

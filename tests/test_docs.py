@@ -22,13 +22,12 @@ from typer.main import get_command
 
 from astra_data.cli.app import app
 from astra_data.core.config import Config
-from astra_data.core.progress import silent
 from astra_data.io import mapping  # noqa: F401 - has the keys of mappings
 from astra_data.pipeline import recipe  # noqa: F401 - has all tables of settings
 from astra_data.pipeline.stages.align import align
 from astra_data.pipeline.stages.collect import CollectConfig, collect
 from astra_data.pipeline.stages.ground import ground
-from astra_data.pipeline.stages.pair import PairConfig, pair
+from astra_data.pipeline.stages.pair import pair
 from astra_data.pipeline.stages.train import train
 
 ROOT = Path(__file__).parents[1]
@@ -84,16 +83,15 @@ def quickstart(tmp_path_factory: pytest.TempPathFactory) -> Path:
     run = folder / "runs" / "antmaze_quick"
     out = {stage: run / stage / "astra" / "seed_0" for stage in ("ground", "train", "align")}
     collected, pairs = run / "collect" / "seed_0", run / "pair" / "seed_0"
-    made = {"seed": 0, "device": "cpu", "progress": silent}
     run.mkdir(parents=True)
     (run / "recipe.json").write_text('{"task": "antmaze-umaze", "evaluate": {"episodes": 2}}')
     with short_task(), pytest.MonkeyPatch.context() as patch:
         fit_quickly(patch)
-        collect(TASK, CollectConfig(episodes=100, max_steps=25), seed=0, out=collected, progress=silent)
-        pair(TASK, PairConfig(), dataset=collected, out=pairs, progress=silent)
+        collect(TASK, CollectConfig(episodes=100, max_steps=25), out=collected)
+        pair(TASK, dataset=collected, out=pairs)
         few = GROUND.model_copy(update={"updates": 2})
-        ground(TASK, "astra", few, dataset=pairs, out=out["ground"], **made)  # type: ignore[arg-type]
-        inputs: dict[str, Any] = {"dataset": pairs, "grounding": out["ground"], **made}
+        ground(TASK, "astra", few, dataset=pairs, out=out["ground"])
+        inputs: dict[str, Any] = {"dataset": pairs, "grounding": out["ground"]}
         train(TASK, "astra", TRAIN, out=out["train"], **inputs)
         align(ALIGN.model_copy(update={"updates": 2}), out=out["align"], **inputs)
     (run.parent / "quickstart").symlink_to(run.name)

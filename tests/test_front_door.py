@@ -13,7 +13,6 @@ from fake_dataset import write_fake
 
 import astra_data
 from astra_data.core.errors import EXTRAS, BadInputError
-from astra_data.core.progress import silent
 from astra_data.pipeline.stages.collect import CollectConfig, collect
 from astra_data.robots.registry import TASKS
 
@@ -71,7 +70,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder with what the examples begin with: walks, their pairs, and a small recipe."""
     made = tmp_path_factory.mktemp("examples")
     config = CollectConfig(episodes=12, max_steps=20, start="task")
-    collect("antmaze-umaze", config, seed=0, name="walks", out=made / "walks", progress=silent)
+    collect("antmaze-umaze", config, name="walks", out=made / "walks")
     astra_data.pair("antmaze-umaze", dataset=made / "walks", out=made / "pairs")
     (made / "small.toml").write_text(RECIPE)
     return made

@@ -173,15 +173,6 @@ def test_help_names_what_options_take() -> None:
         assert not re.search(r"list\[|<(int|str|float|path)", shown), shown
 
 
-def test_bad_input_is_one_line_and_exit_code_1(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(sys, "argv", ["astra-data", "check", str(tmp_path / "none.toml")])
-    with pytest.raises(SystemExit, match="1"):
-        cli.main()
-    assert capsys.readouterr().err == f"error: {tmp_path / 'none.toml'} does not exist\n"
-
-
 def test_a_folder_that_is_gone_is_told(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -14,7 +14,6 @@ from small_run import GROUND, TASK, TRAIN, short_task
 from astra_data.core.artifact import read_manifest
 from astra_data.core.durable import file_digest
 from astra_data.core.errors import BadInputError
-from astra_data.core.progress import silent
 from astra_data.dataset.reader import Dataset
 from astra_data.deployment.folder import deploy, describe, page
 from astra_data.deployment.graph import load_onnx
@@ -22,7 +21,7 @@ from astra_data.grounding.alignment import TargetEncoder
 from astra_data.grounding.model import GroundingModel, GroundingShape
 from astra_data.pipeline.stages.collect import CollectConfig, collect
 from astra_data.pipeline.stages.ground import ground
-from astra_data.pipeline.stages.pair import PairConfig, pair
+from astra_data.pipeline.stages.pair import pair
 from astra_data.pipeline.stages.train import train
 from astra_data.pipeline.trained_policy import load_policy
 from astra_data.policies.networks import ActorCritic, PolicyShape, SoftActor
@@ -37,8 +36,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with short_task(), pytest.MonkeyPatch.context() as patch:
         fit_quickly(patch)
         config = CollectConfig(episodes=4, max_steps=20)
-        walks = collect(TASK, config, seed=0, out=folder / "collect/seed_0", progress=silent)
-        pairs = pair(TASK, PairConfig(), dataset=walks, out=folder / "pair/seed_0")
+        walks = collect(TASK, config, out=folder / "collect/seed_0")
+        pairs = pair(TASK, dataset=walks, out=folder / "pair/seed_0")
         grounding = folder / "ground/nas/seed_0"
         few = GROUND.model_copy(update={"updates": 2})
         ground(TASK, "nas", few, dataset=pairs, out=grounding)

@@ -32,7 +32,7 @@ def make(folder: Path) -> None:
     pairs, grounding = folder / "pair/seed_0", folder / "ground/astra/seed_0"
     with short_task(), pytest.MonkeyPatch.context() as patch:
         fit_quickly(patch)
-        walks = collect(TASK, COLLECT, seed=0, out=folder / "collect/seed_0")
+        walks = collect(TASK, COLLECT, out=folder / "collect/seed_0")
         pair(TASK, dataset=walks, out=pairs)
         ground(TASK, "astra", GROUND, dataset=pairs, out=grounding)
         align(ALIGN, dataset=pairs, grounding=grounding, out=folder / "align/astra/seed_0")

@@ -9,7 +9,6 @@ from typer.testing import CliRunner
 
 from astra_data.cli.app import app
 from astra_data.core.errors import BadInputError, RecipeError
-from astra_data.core.progress import silent
 from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE, Column, Episode
 from astra_data.pipeline.run import check, run
 from astra_data.pipeline.stages.pair import pair
@@ -103,7 +102,7 @@ def test_data_are_not_asked_for_once_they_are_labeled(recipe: Path, monkeypatch:
 
 def test_data_that_were_paired_are_refused(recipe: Path) -> None:
     write_logs(recipe.parent / "first", -1.0, 4.0)
-    pair(f"{recipe.parent}/rail.py:TASK", dataset=recipe.parent / "first", out=recipe.parent / "logs", progress=silent)
+    pair(f"{recipe.parent}/rail.py:TASK", dataset=recipe.parent / "first", out=recipe.parent / "logs")
     with pytest.raises(BadInputError, match=r"data: fake@.* is paired already, but a recipe pairs its data itself"):
         check(recipe, root=recipe.parent / "runs")
 

@@ -11,7 +11,6 @@ import pytest
 import torch
 from quick_runs import small_tables
 
-from astra_data.core.progress import silent
 from astra_data.dataset.columns import GOAL, REWARD
 from astra_data.dataset.edit import filter_episodes, subset
 from astra_data.dataset.reader import Dataset
@@ -37,7 +36,7 @@ def made(
     experiment = load_experiment(path, folder / "runs")
     items = [item for item in plan(experiment.recipe, path, experiment.folder) if wanted(item.key)]
     for item in items:
-        item.call(progress=silent)
+        item.call()
     (experiment.folder / "recipe.json").write_text(experiment.recipe.model_dump_json())
     return experiment.folder, [item.key for item in items]
 
@@ -112,7 +111,7 @@ def test_other_data_of_the_same_name_are_labeled_anew(cart: Path, tmp_path: Path
     path.write_text(path.read_text().replace('data = "logs"', 'data = "whole"'))
     experiment = load_experiment(path, tmp_path / "runs")
     (item,) = [item for item in plan(experiment.recipe, path, experiment.folder) if item.key == "label/seed_0"]
-    item.call(progress=silent)
+    item.call()
     assert (experiment.folder / "label/seed_0").is_symlink() and condition(item, experiment).state == "finished"
     # What was made of it since is no other; what was made of another is.
     link = experiment.folder / "label/seed_0"

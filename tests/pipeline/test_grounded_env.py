@@ -17,7 +17,6 @@ import astra_data.envs
 from astra_data.cli.app import app
 from astra_data.core.artifact import read_manifest, write_manifest
 from astra_data.core.errors import AstraDataError, BadInputError
-from astra_data.core.progress import silent
 from astra_data.grounding.files import load_target_encoder, save_target_encoder
 from astra_data.pipeline import grounded_env
 from astra_data.pipeline.experiment import load_experiment
@@ -99,7 +98,7 @@ def test_it_is_the_environment_that_the_row_was_trained_in(run: Path, monkeypatc
     items = {item.key: item for item in plan(experiment.recipe, experiment.path, run)}
     call: Any = items["train/astra_plus/seed_0"].call
     config = call.keywords["config"].model_copy(update={"data_start_share": 0.25})
-    call(config=config, out=run.parents[1] / "again", progress=silent)
+    call(config=config, out=run.parents[1] / "again")
     trained, ours = built[0], world_of(run, "astra_plus", seed=0, data_start_share=0.25)
     plain = (str, float, int, bool)
     switches = {name: value for name, value in vars(trained).items() if isinstance(value, plain)}
@@ -167,7 +166,6 @@ def test_what_does_not_fit_is_answered_by_a_line(run: Path, tmp_path: Path) -> N
             make(ID, **{"run": run, "row": "nas"} | options)
         assert "\n" not in str(raised.value)
 
-    refused("expected the folder of a run", run=tmp_path)
     refused("unknown method 'nass'", row="nass")
     refused("iql is not trained in a simulator: .* direct_transfer for the raw simulator", row="iql")
     refused(r"expected .*pair/seed_3, .*ground/nas/seed_3: run the recipe first", seed=3)
@@ -204,7 +202,7 @@ def test_a_rows_own_network_behind_the_protocol_has_the_rows_figures(
     read.assert_called_once_with(run)
     experiment = load_experiment(run.parents[1] / "cart.toml", run.parent)
     items = {item.key: item for item in plan(experiment.recipe, experiment.path, run)}
-    items["evaluate/astra/seed_0"].call(out=tmp_path / "row", progress=silent)
+    items["evaluate/astra/seed_0"].call(out=tmp_path / "row")
     own, row = (json.loads((tmp_path / name / "evaluation.json").read_text()) for name in ("own", "row"))
     for simulator in ("simulated", "raw", "grounded"):
         assert own[simulator] == row[simulator]
@@ -287,8 +285,6 @@ def test_the_command_says_what_a_policy_of_ones_own_is_given_with(tmp_path: Path
     ):
         with pytest.raises(BadInputError, match="with --policy, give one --method, one --seed and --out"):
             app(["evaluate", "cart.toml", *given], standalone_mode=False)
-    with pytest.raises(BadInputError, match="--out goes with --policy"):
-        app(["evaluate", "cart.toml", *one, *out], standalone_mode=False)
 
 
 def test_a_policy_needs_what_its_row_is_tested_with(run: Path, tmp_path: Path) -> None:

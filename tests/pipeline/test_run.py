@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fake_runs import bare_results
+from fake_runs import line, results
 from fake_stages import FakeStages
 
 from astra_data.core.artifact import MANIFEST
@@ -418,21 +418,21 @@ def test_a_sweep_goes_on_point_by_point_and_makes_shared_artifacts_once(
 def test_a_report_is_added_to_what_is_published_beside_the_recipe(
     recipe: Path, tmp_path: Path, stages: FakeStages
 ) -> None:
-    results, text = tmp_path / "results", HEAD.replace('"astra_plus"', '"target"')
+    place, text = tmp_path / "results", HEAD.replace('"astra_plus"', '"target"')
     recipe.write_text(text)
     run_stage(recipe, "report", root=tmp_path, publish=True)
     asked = stages.asked["report"]
-    assert (asked["publish"], asked["published"]) == (results, [])
+    assert (asked["publish"], asked["published"]) == (place, [])
     settings = load_experiment(recipe, tmp_path).recipe.settings
-    (results / "r").mkdir(parents=True)
-    (results / "r/results.json").write_text(results_json(bare_results("r", {"astra": [0]}, settings)))
+    (place / "r").mkdir(parents=True)
+    (place / "r/results.json").write_text(results_json(results(line("astra", 0, success=0.0), settings=settings)))
     run_stage(recipe, "report", root=tmp_path, publish=True)
-    assert stages.asked["report"]["published"] == [results / "r/results.json"]
+    assert stages.asked["report"]["published"] == [place / "r/results.json"]
     run_stage(recipe, "report", root=tmp_path)
     assert stages.asked["report"]["publish"] is None
     for table in ("[report]\ntrajectory_episodes = 7\n", "[rma]\nextrinsics_size = 7\n"):
         recipe.write_text(text + table)
-        assert load_experiment(recipe, tmp_path).published() == [results / "r/results.json"]
+        assert load_experiment(recipe, tmp_path).published() == [place / "r/results.json"]
     recipe.write_text(text + "[evaluate]\nepisodes = 7\n")
     with pytest.raises(RecipeError, match=r"^evaluate \(episodes: 100, now 7\) changed .* since the results"):
         run_stage(recipe, "report", root=tmp_path, publish=True)

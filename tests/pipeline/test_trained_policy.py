@@ -147,14 +147,12 @@ def test_a_run_of_several_sizes_is_asked_for_one(run: Path, tmp_path: Path) -> N
         load_policy(run, "astra_plus", percent=25)
 
 
-def test_no_run_and_no_policy_are_refused(run: Path, tmp_path: Path) -> None:
+def test_what_is_no_run_is_refused(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match=r"expected the folder of a run \(with recipe\.json"):
         load_policy(tmp_path, "astra")
     (tmp_path / "recipe.json").write_text("{")
     with pytest.raises(BadInputError, match=r"recipe\.json is not what a run writes"):
         load_policy(tmp_path, "astra")
-    with pytest.raises(BadInputError, match="follower has no trained policy"):
-        load_policy(run, "follower")
 
 
 def test_a_policy_aligned_with_inputs_runs_by_them_and_is_not_deployed_as_a_folder(

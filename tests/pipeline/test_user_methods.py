@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from fake_runs import bare_results
+from fake_runs import line, results
 
 from astra_data.core.errors import RecipeError
 from astra_data.methods import METHODS
@@ -96,7 +96,7 @@ def test_results_that_were_published_with_other_settings_of_theirs_are_not_the_r
     def published(**changes: object) -> None:
         row = "nas" if changes.pop("other", None) else "delta"
         (tmp_path / "results/own").mkdir(parents=True, exist_ok=True)
-        found = bare_results("own", {row: [0]}, settings | changes)
+        found = results(line(row, 0, success=0.0), settings=settings | changes)
         (tmp_path / "results/own/results.json").write_text(results_json(found))
 
     published()

@@ -2,6 +2,7 @@ import json
 from pathlib import Path
 
 import pytest
+from fake_runs import line, results
 
 from astra_data.core.errors import BadInputError
 from astra_data.reports.results import (
@@ -9,9 +10,7 @@ from astra_data.reports.results import (
     TESTED,
     DatasetUse,
     Errors,
-    Line,
     Origin,
-    Results,
     TrainingFacts,
     elapsed_seconds,
     judged_horizon,
@@ -23,15 +22,6 @@ from astra_data.reports.results import (
     stage_seconds,
 )
 from astra_data.worlds.objective import SURVIVED_STEPS
-
-
-def line(row: str, seed: int, where: str = TESTED, percent: int = 100, **values: float) -> Line:
-    return Line(row=row, seed=seed, percent=percent, where=where, values=values)
-
-
-def results(*lines: Line, **changes: object) -> Results:
-    facts = {"recipe": "r", "task": "t", "command": "c", "rows": ("direct_transfer", "astra"), "episodes": 4}
-    return Results.model_validate(facts | {"lines": lines} | changes)
 
 
 def error(row: str, seed: int, simulator: str, *mean: float, horizons: tuple[int, ...] = (1, 10)) -> Errors:
@@ -56,6 +46,7 @@ def test_numbers_are_found_by_method_place_and_size() -> None:
         line("astra", 0, SIMULATED, success=0.25),
         line("astra", 0, percent=20, success=0.0),
         line("nas", 0, success=0.0),
+        rows=("direct_transfer", "astra"),
     )
     assert found.values("astra", "success") == {0: 1.0, 1: 0.5}
     assert found.values("astra", "success", SIMULATED) == {0: 0.25}
@@ -131,11 +122,12 @@ def test_errors_are_averaged_over_seeds_where_all_know_them() -> None:
             *(error("nas", seed, "grounded", 1.0 + seed, 10.0) for seed in (0, 1)),
             *(error("nas", seed, "raw", 4.0, 40.0) for seed in (0, 1)),
             error("astra", 0, "grounded", 0.5, horizons=(1,)),
-        ]
+        ],
+        rows=("nas",),
     )
     means = found.mean_errors()
     assert means.loc[("nas", "grounded", "x_m", 1)].tolist() == [1.5, 0.75, 3.0]
-    assert set(means.index.get_level_values("horizon")) == {1} and found.groundings() == ["astra", "nas"]
+    assert set(means.index.get_level_values("horizon")) == {1} and found.groundings() == ["nas", "astra"]
 
 
 @pytest.mark.parametrize(("horizons", "expected"), [((1, 10, 50), 10), ((1, 5, 20), 5), ((20, 50), 20)])

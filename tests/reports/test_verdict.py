@@ -2,13 +2,15 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
+import fake_runs
 import pytest
+from fake_runs import line
 from typer.testing import CliRunner
 
 from astra_data.cli.app import app
 from astra_data.cli.recipes import show_made
 from astra_data.reports.choice import Candidate, Judgment
-from astra_data.reports.results import SIMULATED, TESTED, Errors, Line, Results, results_json
+from astra_data.reports.results import SIMULATED, TESTED, Errors, Results, results_json
 from astra_data.reports.verdict import Verdict, verdict_of
 from astra_data.worlds.objective import SURVIVED_STEPS
 
@@ -25,16 +27,13 @@ def results(
 ) -> Results:
     """Of episodes without success, the share `failing` are failures."""
     lines = [
-        Line(
-            row=row, seed=seed, where=where, values={"success": one, "steps": 100 * one, "failed": failing * (1 - one)}
-        )
+        line(row, seed, where, success=one, steps=100 * one, failed=failing * (1 - one))
         for where, of in ((TESTED, target), (SIMULATED, simulated or {}))
         for row, scores in of.items()
         for seed, one in enumerate(scores)
     ]
-    lines += [Line(row=row, seed=0, where="ground", values={"r2_reward": value}) for row, value in (r2 or {}).items()]
-    given = {"recipe": "r", "task": "t", "command": "c", "rows": tuple(target), "episodes": 120}
-    return Results.model_validate(given | {"lines": lines} | facts)
+    lines += [line(row, 0, "ground", r2_reward=value) for row, value in (r2 or {}).items()]
+    return fake_runs.results(*lines, **{"rows": tuple(target), "episodes": 120} | facts)
 
 
 FLOOR = {"direct_transfer": (0.2, 0.1, 0.2)}

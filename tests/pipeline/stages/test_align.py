@@ -12,7 +12,7 @@ from toy_episodes import no_episodes
 
 from astra_data.core.durable import file_digest
 from astra_data.core.errors import BadInputError
-from astra_data.core.progress import Progress, silent
+from astra_data.core.progress import Progress
 from astra_data.dataset.columns import ABSTRACT_STATE, STATE, Column
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import next_version
@@ -88,7 +88,7 @@ def test_the_paired_weight_adds_the_distance_of_paired_latents(paired: Path, gro
     for weight in (0.0, 100.0):
         out = tmp_path / str(weight)
         config = ALIGN.model_copy(update={"updates": 10, "paired_weight": weight})
-        align(config, dataset=paired, grounding=grounded, seed=0, out=out, device="cpu", progress=silent)
+        align(config, dataset=paired, grounding=grounded, out=out)
         distances.append(json.loads((out / "metrics.json").read_text())["latent_rmse"])
     assert distances[1] < distances[0]
 
@@ -108,7 +108,7 @@ def test_where_phi_drops_the_place_the_encoder_does_not_see_it(
     placeless = replace(whole, dropped_place=(0, 1))
     monkeypatch.setattr(PairedEpisodes, "load", lambda *_: placeless)
     config, out = ALIGN.model_copy(update={"updates": 1}), tmp_path / "align"
-    align(config, dataset=paired, grounding=grounded, seed=0, out=out, device="cpu", progress=silent)
+    align(config, dataset=paired, grounding=grounded, out=out)
     scale = load_target_encoder(out / "target_encoder.safetensors").state_std
     assert scale[:2].isinf().all()
     torch.testing.assert_close(scale[2:], load_target_encoder(aligned / "target_encoder.safetensors").state_std[2:])
@@ -122,7 +122,7 @@ def test_after_an_interruption_it_goes_on(paired: Path, grounded: Path, aligned:
     out = tmp_path / "interrupted"
 
     def begin(progress: Progress) -> None:
-        align(ALIGN, dataset=paired, grounding=grounded, seed=0, out=out, device="cpu", progress=progress)
+        align(ALIGN, dataset=paired, grounding=grounded, out=out, progress=progress)
 
     with pytest.raises(Stopped):
         begin(stop)
@@ -141,7 +141,7 @@ def test_the_encoder_is_as_large_as_the_source_and_sees_as_many_waves(paired: Pa
     made = HistoryGrounding(GroundingModel(shape))
     save_grounding(tmp_path / "grounding.safetensors", made, no_episodes())
     config = ALIGN.model_copy(update={"updates": 1})
-    align(config, dataset=paired, grounding=tmp_path, out=tmp_path / "out", progress=silent)
+    align(config, dataset=paired, grounding=tmp_path, out=tmp_path / "out")
     sizes = load_target_encoder(tmp_path / "out/target_encoder.safetensors").sizes
     assert (sizes["latent_size"], sizes["embedding_size"], sizes["position_octaves"]) == (8, 24, 1)
 
@@ -167,7 +167,7 @@ def test_inputs_are_read_in_place_of_states_and_phi_is_estimated_from_them(
     seen: Path, paired: Path, grounded: Path, tmp_path: Path
 ) -> None:
     config = ALIGN.model_copy(update={"inputs": (SEEN,)})
-    align(config, dataset=seen, grounding=grounded, seed=0, out=tmp_path / "out")
+    align(config, dataset=seen, grounding=grounded, out=tmp_path / "out")
     encoder = load_target_encoder(tmp_path / "out/target_encoder.safetensors")
     assert encoder.inputs == {SEEN: 5} and encoder.pictures[SEEN]["encoder"] == "eyes.py:EYES"
     windows = PairedEpisodes.load(paired).split(ALIGN.held_out_share, 0)[1].windows

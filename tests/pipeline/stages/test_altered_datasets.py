@@ -12,7 +12,6 @@ from small_run import TASK
 
 from astra_data.cli.sharing import export as export_card
 from astra_data.core.errors import CorruptDatasetError
-from astra_data.core.progress import silent
 from astra_data.dataset.compare import differences
 from astra_data.dataset.edit import filter_episodes, merge, subset
 from astra_data.dataset.inspection import inspect_dataset
@@ -20,7 +19,7 @@ from astra_data.dataset.reader import Dataset
 from astra_data.io.exporters import export
 from astra_data.io.hub.sharing import push
 from astra_data.pipeline.stages.augment import AugmentConfig, augment
-from astra_data.pipeline.stages.pair import PairConfig, pair
+from astra_data.pipeline.stages.pair import pair
 
 Command = Callable[[Path, Path], object]
 """Read a dataset and write to a path."""
@@ -34,10 +33,8 @@ COMMANDS: dict[str, Command] = {
     "subset": lambda root, out: subset(opened(root), percent=100, out=out),
     "merge": lambda root, out: merge([opened(root), opened(root)], new_uids=True, out=out),
     "filter": lambda root, out: filter_episodes(opened(root), min_length=1, out=out),
-    "augment": lambda root, out: augment(
-        TASK, AugmentConfig(episodes=10), dataset=root, seed=0, out=out, progress=silent
-    ),
-    "pair": lambda root, out: pair(TASK, PairConfig(), dataset=root, out=out, progress=silent),
+    "augment": lambda root, out: augment(TASK, AugmentConfig(episodes=10), dataset=root, out=out),
+    "pair": lambda root, out: pair(TASK, dataset=root, out=out),
     "card": lambda root, out: export_card(str(root), format="card", out=out),
     "export": lambda root, out: export(opened(root), out, format="d4rl"),
     "diff": lambda root, _: differences(opened(root), opened(root)),

@@ -10,7 +10,6 @@ import torch
 from small_run import TASK, short_task
 
 from astra_data.core.errors import BadInputError
-from astra_data.core.progress import silent
 from astra_data.dataset.columns import (
     ACTION,
     DONE,
@@ -30,7 +29,7 @@ from astra_data.dataset.writer import DatasetWriter
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.pipeline.stages.augment import AugmentConfig, Relocation, _moving, _shares, augment
 from astra_data.pipeline.stages.collect import CollectConfig, collect
-from astra_data.pipeline.stages.pair import PairConfig, pair
+from astra_data.pipeline.stages.pair import pair
 from astra_data.robots.ant.tasks import WALL_REACH_M
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.geometry import rotation_matrix
@@ -48,7 +47,7 @@ def known_task(task: str) -> None:
 def augmented(collected: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("augmented") / "turned"
     with short_task():
-        return augment(None, CONFIG, dataset=collected, seed=1, out=out, progress=silent)
+        return augment(None, CONFIG, dataset=collected, seed=1, out=out)
 
 
 def facts(dataset: Dataset, index: int) -> dict[str, Any]:
@@ -175,8 +174,8 @@ def test_the_seed_decides_every_byte(collected: Path, augmented: Path, tmp_path:
     def contents(root: Path) -> list[bytes]:
         return [path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()]
 
-    again = augment(TASK, CONFIG, dataset=collected, seed=1, out=tmp_path / "again", progress=silent)
-    other = augment(TASK, CONFIG, dataset=collected, seed=2, out=tmp_path / "other", progress=silent)
+    again = augment(TASK, CONFIG, dataset=collected, seed=1, out=tmp_path / "again")
+    other = augment(TASK, CONFIG, dataset=collected, seed=2, out=tmp_path / "other")
     assert contents(again) == contents(augmented)
     uids = [set(Dataset.open(root).uids.tolist()) for root in (collected, augmented, other)]
     assert uids[1] & uids[2] == uids[0]
@@ -227,14 +226,13 @@ def test_copies_without_a_place_are_counted_and_none_at_all_is_an_error(
 ) -> None:
     copied, asked = Relocation.copied, iter(range(1000))
     monkeypatch.setattr(Relocation, "copied", lambda *given: copied(*given) if next(asked) % 3 == 0 else None)
-    given: Any = {"dataset": collected, "seed": 0, "progress": silent}
     config = AugmentConfig(min_steps=5)
-    told = Dataset.open(augment(None, config, out=tmp_path / "some", **given)).description
+    told = Dataset.open(augment(None, config, dataset=collected, out=tmp_path / "some")).description
     assert told["copies_without_place"] == 2 * told["copies"] > 0
     assert told["copies"] + told["episodes_not_copied"] == 7  # all of the eight but the one held out
     monkeypatch.setattr(Relocation, "copied", lambda *given: None)
     with pytest.raises(BadInputError, match=r"found no place for any of \d+ copies: lower --margin-m"):
-        augment(None, config, out=tmp_path / "none", **given)
+        augment(None, config, dataset=collected, out=tmp_path / "none")
     assert [path.name for path in tmp_path.iterdir()] == ["some"]
 
 
@@ -260,7 +258,7 @@ def test_copies_differ_from_what_they_are_of() -> None:
 )
 def test_what_cannot_be_done_is_told(collected: Path, tmp_path: Path, changes: dict[str, Any], told: str) -> None:
     with pytest.raises(BadInputError, match=told):
-        augment(None, AugmentConfig(**changes), dataset=collected, seed=0, out=tmp_path / "out", progress=silent)
+        augment(None, AugmentConfig(**changes), dataset=collected, out=tmp_path / "out")
     assert not list(tmp_path.iterdir())
 
 
@@ -281,7 +279,7 @@ def test_datasets_that_do_not_fit_are_refused(collected: Path, augmented: Path, 
         (mute, "nao-kick", r"observation.state has 29 values, expected those of nao-kick: \d+"),
     ):
         with pytest.raises(BadInputError, match=told):
-            augment(task, CONFIG, dataset=dataset, seed=0, out=tmp_path / "out", progress=silent)
+            augment(task, CONFIG, dataset=dataset, out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -295,15 +293,15 @@ def test_code_that_a_dataset_names_is_not_run(collected: Path, tmp_path: Path) -
     with DatasetWriter(foreign, source.schema, fps=20, task="run", description=description) as writer:
         writer.add(next(source.episodes()))
     with pytest.raises(BadInputError, match=r"task\.py:TASK, whose code would be run: read it"):
-        augment(None, CONFIG, dataset=foreign, seed=0, out=tmp_path / "out", progress=silent)
+        augment(None, CONFIG, dataset=foreign, out=tmp_path / "out")
     assert not (tmp_path / "ran").exists()
 
 
 def test_balls_are_moved_with_their_robots(tmp_path: Path) -> None:
     kicking, task = tmp_path / "kicking", TASKS["nao-kick"]
-    collect("nao-kick", CollectConfig(episodes=3, max_steps=20), seed=0, out=kicking, progress=silent)
+    collect("nao-kick", CollectConfig(episodes=3, max_steps=20), out=kicking)
     config = AugmentConfig(episodes=9, held_out_share=0.3, min_steps=5)
-    folder = augment(None, config, dataset=kicking, seed=0, out=tmp_path / "out", progress=silent)
+    folder = augment(None, config, dataset=kicking, out=tmp_path / "out")
     made = list(copies(Dataset.open(kicking), Dataset.open(folder)))
     assert len(made) == 6
     for copy, source in made:
@@ -312,12 +310,12 @@ def test_balls_are_moved_with_their_robots(tmp_path: Path) -> None:
         apart, before = (path[:, 4:6] - path[:, :2] for path in paths)
         np.testing.assert_allclose(np.linalg.norm(apart, axis=1), np.linalg.norm(before, axis=1), atol=1e-5)
         assert np.abs(apart - before).max() > 0.01
-    paired = pair("nao-kick", PairConfig(), dataset=folder, out=tmp_path / "paired", progress=silent)
+    paired = pair("nao-kick", dataset=folder, out=tmp_path / "paired")
     assert len(PairedEpisodes.load(paired)) == 9
 
 
 def test_grounding_holds_out_what_was_not_copied(augmented: Path, tmp_path: Path) -> None:
-    folder = pair(TASK, PairConfig(), dataset=augmented, out=tmp_path / "paired", progress=silent)
+    folder = pair(TASK, dataset=augmented, out=tmp_path / "paired")
     dataset = Dataset.open(folder)
     first: dict[bool, set[float]] = {False: set(), True: set()}
     for episode, held in zip(dataset.episodes([STATE]), dataset.metadata["held_out"], strict=True):

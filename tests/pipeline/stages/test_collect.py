@@ -10,7 +10,6 @@ from small_run import COLLECT, TASK
 from stopping import Stopped
 
 from astra_data.core.errors import BadInputError
-from astra_data.core.progress import silent
 from astra_data.dataset.columns import ACTION, DONE, NEXT_STATE, REWARD, STATE, SUCCESS, TERMINATED, TRUNCATED, Episode
 from astra_data.dataset.doctor.check import check
 from astra_data.dataset.reader import Dataset
@@ -42,7 +41,7 @@ def test_episodes_are_whole_and_their_steps_follow_each_other(collected: Path) -
 
 def test_stress_is_recorded_with_its_reversals(task: str, tmp_path: Path) -> None:
     config = TINY.model_copy(update={"behavior": "stress", "hold_s": (0.05, 0.05)})
-    collect(task, config, seed=0, out=tmp_path / "stress", progress=silent)
+    collect(task, config, out=tmp_path / "stress")
     dataset = Dataset.open(tmp_path / "stress")
     assert dataset.description["config"]["behavior"] == "stress"
     commands = [episode.columns[ACTION] for episode in dataset.episodes([ACTION])]
@@ -54,7 +53,7 @@ def test_the_seed_decides_everything_and_the_threads_nothing(task: str, tmp_path
     hashes, contents = [], []
     for number, (seed, threads) in enumerate([(1, 1), (1, 2), (2, 2)]):
         out = tmp_path / str(number)
-        collect(task, TINY, seed=seed, out=out, progress=silent, num_threads=threads)
+        collect(task, TINY, seed=seed, out=out, num_threads=threads)
         hashes.append(Dataset.open(out).content_hash)
         files = [path for path in sorted(out.rglob("*")) if path.is_file() and path.name != "dataset.json"]
         contents.append([path.read_bytes() for path in files])
@@ -65,8 +64,8 @@ def test_the_seed_decides_everything_and_the_threads_nothing(task: str, tmp_path
 def test_batches_follow_each_other(task: str, tmp_path: Path) -> None:
     out = tmp_path / "out"
     config = TINY.model_copy(update={"episodes": 5})
-    collect(task, config, seed=0, out=out, progress=silent)
-    collect(task, TINY.model_copy(update={"episodes": 2}), seed=0, out=tmp_path / "two", progress=silent)
+    collect(task, config, out=out)
+    collect(task, TINY.model_copy(update={"episodes": 2}), out=tmp_path / "two")
     batched, two = Dataset.open(out), Dataset.open(tmp_path / "two")
     assert batched.uids.tolist() == [0, 1, 2, 3, 4]
     first, second, *others = batched.episodes()
@@ -82,7 +81,7 @@ def test_an_interrupted_recording_goes_on_to_the_same_bytes(
     task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = TINY.model_copy(update={"episodes": 5})
-    collect(task, config, seed=0, out=tmp_path / "whole", progress=silent)
+    collect(task, config, out=tmp_path / "whole")
     add = StagedWriter.add
     told: list[int | None] = []
 
@@ -95,12 +94,12 @@ def test_an_interrupted_recording_goes_on_to_the_same_bytes(
     out = tmp_path / "out"
     monkeypatch.setattr(StagedWriter, "add", failing)
     with pytest.raises(KeyboardInterrupt):
-        collect(task, config, seed=0, out=out, progress=silent)
+        collect(task, config, out=out)
     monkeypatch.setattr(StagedWriter, "add", add)
     with pytest.raises(BadInputError, match="left 3 episodes; resume it"):
-        collect(task, config, seed=0, out=out, progress=silent, resume=False)
+        collect(task, config, out=out, resume=False)
     assert not out.exists()
-    collect(task, config, seed=0, out=out, progress=silent)
+    collect(task, config, out=out)
     assert Dataset.open(out).content_hash == Dataset.open(tmp_path / "whole").content_hash
 
 
@@ -114,7 +113,7 @@ def test_episodes_begin_where_the_task_does_or_by_default_anywhere_in_a_maze(
     if not has_maze:
         monkeypatch.setattr(Task, "plane", None)
     config = TINY.model_copy(update={"start": start, "max_steps": 1})
-    collect(task, config, seed=0, out=tmp_path / "out", progress=silent)
+    collect(task, config, out=tmp_path / "out")
     position = Dataset.open(tmp_path / "out").columns([STATE])[STATE][:, :2]
     near = np.abs(position - [-4.0, 4.0]).max() < 0.7
     assert near == (not anywhere)
@@ -141,7 +140,7 @@ def test_only_as_many_episodes_are_kept_as_have_the_steps(
     task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     every = TINY.model_copy(update={"episodes": 6})
-    collect(task, every, seed=0, out=tmp_path / "all", progress=silent)
+    collect(task, every, out=tmp_path / "all")
     whole = Dataset.open(tmp_path / "all")
     lengths = [len(episode) for episode in whole.episodes([ACTION])]
     steps = sum(lengths[:2]) + 1  # the third episode is needed, the fourth of its batch is not
@@ -153,7 +152,7 @@ def test_only_as_many_episodes_are_kept_as_have_the_steps(
         return record(*args, **keywords)
 
     monkeypatch.setattr("astra_data.pipeline.stages.collect.record", counted)
-    collect(task, some, seed=0, out=tmp_path / "some", progress=silent)
+    collect(task, some, out=tmp_path / "some")
     kept = Dataset.open(tmp_path / "some")
     assert batches == [range(2), range(2, 4)] and [len(episode) for episode in kept.episodes([ACTION])] == lengths[:3]
     for one, other in zip(whole.episodes([ACTION]), kept.episodes([ACTION]), strict=False):
@@ -161,14 +160,14 @@ def test_only_as_many_episodes_are_kept_as_have_the_steps(
     assert kept.description["config"]["least_steps"] == steps
     exactly = some.model_copy(update={"least_steps": sum(lengths[:2])})
     batches.clear()
-    collect(task, exactly, seed=0, out=tmp_path / "exactly", progress=silent)
+    collect(task, exactly, out=tmp_path / "exactly")
     assert len(Dataset.open(tmp_path / "exactly")) == 2 and batches == [range(2)]
 
 
 def test_too_few_episodes_for_the_steps_are_told(task: str, tmp_path: Path) -> None:
     config = TINY.model_copy(update={"episodes": 2, "max_steps": 5, "least_steps": 11})
     with pytest.raises(BadInputError, match=r"least_steps: expected 11, got 10 in 2 episodes: raise episodes"):
-        collect(task, config, seed=0, out=tmp_path / "out", progress=silent)
+        collect(task, config, out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -184,7 +183,7 @@ def test_after_interruptions_the_policy_is_not_trained_again(
     }[learner]
     config = CollectConfig(**settings, episodes=3, max_steps=3)  # type: ignore[arg-type]
     whole, out = tmp_path / "whole", tmp_path / "out"
-    collect(name, config, seed=0, out=whole, progress=silent)
+    collect(name, config, out=whole)
 
     def notes_until(kind: str, count: int) -> int:
         """Return how many notes on the training there are before the `count`-th note of a `kind` stops it."""
@@ -196,15 +195,15 @@ def test_after_interruptions_the_policy_is_not_trained_again(
                 raise Stopped
 
         with pytest.raises(Stopped):
-            collect(name, config, seed=0, out=out, progress=stop)
+            collect(name, config, out=out, progress=stop)
         assert not out.exists()
         return sum("training" in note for note in notes)
 
     assert notes_until("training", 3) == 3
     with pytest.raises(BadInputError, match="left an unfinished recording; resume it"):
-        collect(name, config, seed=0, out=out, progress=silent, resume=False)
+        collect(name, config, out=out, resume=False)
     assert notes_until("target steps/s", 1) == 1 and notes_until("target steps/s", 1) == 0
-    collect(name, config, seed=0, out=out, progress=silent)
+    collect(name, config, out=out)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "whole"]
     policy = "meta/astra/policy.safetensors"
     assert (out / policy).read_bytes() == (whole / policy).read_bytes()
@@ -218,10 +217,10 @@ def test_after_interruptions_the_policy_is_not_trained_again(
 @pytest.mark.usefixtures("small_training")
 def test_the_policy_that_acted_is_kept(lasting: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     config = CollectConfig(behavior="suboptimal_sac", start="task", episodes=3, max_steps=3)
-    first = Dataset.open(collect(lasting, config, seed=0, out=tmp_path / "first", progress=silent))
+    first = Dataset.open(collect(lasting, config, out=tmp_path / "first"))
     kept = PolicyFile.load(first.root / "meta/astra/policy.safetensors")
     monkeypatch.setattr(stage, "suboptimal_by_sac", lambda *_, **__: (kept, {}))
-    second = Dataset.open(collect(lasting, config, seed=0, out=tmp_path / "second", progress=silent))
+    second = Dataset.open(collect(lasting, config, out=tmp_path / "second"))
     assert second.content_hash == first.content_hash
     report = check(first.root)
     assert not report.notes and not report.faults
@@ -247,7 +246,7 @@ def test_commands_that_lead_to_walls_are_replaced_where_it_is_asked_for(task: st
     for clearance_m in (0.0, 1.0):
         settings = {"hold_s": (0.05, 0.05), "clearance_m": clearance_m}
         out = tmp_path / str(clearance_m)
-        collect(task, TINY.model_copy(update=settings), seed=0, out=out, progress=silent)
+        collect(task, TINY.model_copy(update=settings), out=out)
         columns = Dataset.open(out).columns([STATE, ACTION])
         watch = WallWatch(TASKS[task], 1.0)
         commands = columns[ACTION][:, None].astype(np.float64)

@@ -16,7 +16,6 @@ from astra_data.core.artifact import read_manifest, write_manifest
 from astra_data.core.checkpoint import load_tensors
 from astra_data.core.durable import file_digest
 from astra_data.core.errors import BadInputError
-from astra_data.core.progress import silent
 from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE, Column, Episode
 from astra_data.grounding.files import load_target_encoder, save_target_encoder
 from astra_data.grounding.model import GroundingModel
@@ -41,8 +40,7 @@ def make(
     config: EvaluateConfig = CONFIG,
     num_threads: int | None = None,
 ) -> Result:
-    paths: dict[str, Any] = {"policy": None, "grounding": None, "target_encoder": None} | (inputs or {})
-    evaluate(task, method, config, **paths, seed=0, out=out, progress=silent, num_threads=num_threads)
+    evaluate(task, method, config, **(inputs or {}), out=out, num_threads=num_threads)  # type: ignore[arg-type]
     tensors, _ = load_tensors(out / "trajectories.safetensors")
     return json.loads((out / "evaluation.json").read_text()), tensors
 
@@ -159,8 +157,7 @@ def test_simulators_that_all_rows_share_begin_and_reward_alike(
     # Its own world is the reference here, but for the reward that it predicts.
     assert astra["grounded"] == astra["simulated"] | {"return": astra["grounded"]["return"]}
     assert astra["grounded"]["return"] != astra["simulated"]["return"] != astra["raw"]["return"]
-    raw = {"dataset": paired, "grounding": None, "seed": 0, "out": tmp_path / "train", "device": "cpu"}
-    train(task, "direct_transfer", TRAIN, **raw, progress=silent)  # type: ignore[arg-type]
+    train(task, "direct_transfer", TRAIN, dataset=paired, out=tmp_path / "train")
     inputs = {"policy": tmp_path / "train", "reference": grounded}
     transferred, _ = make(task, "direct_transfer", tmp_path / "direct_transfer", inputs)
     assert transferred["raw"] == transferred["simulated"] != transferred["grounded"]
@@ -250,10 +247,8 @@ def test_an_episode_ends_with_its_success(
 
 def test_a_student_is_tested_in_the_target_and_in_its_varied_simulator(task: str, paired: Path, tmp_path: Path) -> None:
     settings = RmaConfig(history_length=40, adaptation_steps=64)
-    policy = tmp_path / "policy"
-    inputs = {"dataset": paired, "grounding": None, "settings": settings}
-    train(task, "rma", TRAIN, **inputs, seed=0, out=policy, device="cpu", progress=silent)  # type: ignore[arg-type]
-    told, paths = make(task, "rma", tmp_path / "out", {"policy": policy})
+    train(task, "rma", TRAIN, settings=settings, dataset=paired, out=tmp_path / "policy")
+    told, paths = make(task, "rma", tmp_path / "out", {"policy": tmp_path / "policy"})
     for world in ("target", "simulated"):
         check_outcome(told[world], paths[f"{world}.position"])
 

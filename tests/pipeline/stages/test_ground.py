@@ -30,7 +30,7 @@ def test_of_a_reward_that_abstract_states_tell_whole_nothing_is_left_to_correct(
     scales = {}
     for row in ("astra_printed", "astra"):
         config, out = GROUND.model_copy(update={"updates": 1}), tmp_path / row
-        ground(task, row, config, dataset=paired, seed=0, out=out, device="cpu", progress=silent)
+        ground(task, row, config, dataset=paired, out=out)
         model = load_history_model(out / "grounding.safetensors")
         assert model.shape.corrects_reward == (row == "astra")
         scales[row] = float(model.reward_std[-1])
@@ -38,7 +38,7 @@ def test_of_a_reward_that_abstract_states_tell_whole_nothing_is_left_to_correct(
 
 
 def make(task: str, dataset: Path, out: Path, method: str = "astra", progress: Progress = silent) -> bytes:
-    ground(task, method, GROUND, dataset=dataset, seed=0, out=out, device="cpu", progress=progress)
+    ground(task, method, GROUND, dataset=dataset, out=out, progress=progress)
     return (out / "grounding.safetensors").read_bytes()
 
 

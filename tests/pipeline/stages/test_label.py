@@ -220,33 +220,6 @@ def test_what_is_no_log_of_the_task_is_refused(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize(
-    ("names", "units", "fault"),
-    [
-        (("x", "speed"), ["m", "m/s"], None),
-        (("speed", "x"), ["", ""], "has the values speed, x in observation.state, expected the order x, speed"),
-        (("x", "speed"), ["mm", "m/s"], "has x of observation.state in mm, expected m: scale it on import"),
-    ],
-)
-def test_states_in_another_order_or_other_units_are_refused(
-    names: tuple[str, ...] | None, units: list[str] | None, fault: str | None, tmp_path: Path
-) -> None:
-    task = task_named(CART)
-    task = replace(task, state=replace(task.state, astra={"unit": ["m", "m/s"]}))
-    astra = None if units is None else {"unit": units}
-    columns = [Column(name, size=2, names=names, astra=astra) for name in (STATE, NEXT_STATE)]
-    with DatasetWriter(
-        tmp_path / "logs", [*columns, COLUMNS[1]], fps=10, task="drive", description={"name": "logs", "stage": "import"}
-    ) as writer:
-        writer.add(Episode(0, drive(0.1, 3), {}))
-    logs = Dataset.open(tmp_path / "logs")
-    if fault is None:
-        check_fits(logs, task)
-    else:
-        with pytest.raises(BadInputError, match=fault):
-            check_fits(logs, task)
-
-
 def test_a_dataset_of_another_rate_is_refused(tmp_path: Path) -> None:
     logs = Dataset.open(write(tmp_path / "logs", [drive(0.1, 3)]))
     task = task_named(CART)

@@ -6,7 +6,6 @@ import pytest
 from fake_dataset import fake_episodes, write_fake, writer
 
 from astra_data.core.errors import BadInputError
-from astra_data.core.progress import silent
 from astra_data.dataset.reader import Dataset
 from astra_data.pipeline.stages.subset import subset
 
@@ -16,7 +15,7 @@ def test_sizes_are_datasets_of_their_own_one_inside_the_other(tmp_path: Path) ->
     uids: set[int] = set()
     for percent, count in ((50, 2), (100, 4), (125, 5)):
         out = tmp_path / str(percent)
-        assert subset(tmp_path / "pair", percent=percent, of=4, out=out, progress=silent) == out
+        assert subset(tmp_path / "pair", percent=percent, of=4, out=out) == out
         made = Dataset.open(out)
         assert made.verify() == [] and len(made) == count
         assert made.reference == f"fake-percent{percent:03d}@data-1.0.0"
@@ -46,4 +45,4 @@ def test_episodes_that_are_marked_as_held_out_are_in_every_size_and_no_part_of_i
         assert held_out < uids and len(uids) == 2 + others
     assert notes == ["1 of 3 episodes", "3 of 3 episodes"]
     with pytest.raises(BadInputError, match="has 3 episodes, but the subset has 134 % of 3 = 4: expected 1 to 3"):
-        subset(tmp_path / "pair", percent=134, out=tmp_path / "out", progress=silent)
+        subset(tmp_path / "pair", percent=134, out=tmp_path / "out")

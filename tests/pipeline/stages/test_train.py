@@ -23,6 +23,7 @@ from astra_data.robots.registry import TASKS
 
 RMA = RmaConfig(history_length=40, adaptation_steps=64 * 4)
 """Four iterations after the six of `TRAIN`."""
+FILES = {"config.json", "curve.json", "manifest.json", "policy.safetensors"}
 
 
 def make(
@@ -35,17 +36,12 @@ def make(
     progress: Progress = silent,
 ) -> bytes:
     inputs = {"dataset": dataset, "grounding": grounding, "settings": RMA if method == "rma" else None}
-    train(task, method, config, **inputs, seed=0, out=out, device="cpu", progress=progress)  # type: ignore[arg-type]
+    train(task, method, config, **inputs, out=out, progress=progress)  # type: ignore[arg-type]
     return (out / "policy.safetensors").read_bytes()
 
 
 def test_the_artifact_is_complete(task: str, grounded: Path, trained: Path) -> None:
-    assert {file.name for file in trained.iterdir()} == {
-        "config.json",
-        "curve.json",
-        "manifest.json",
-        "policy.safetensors",
-    }
+    assert {file.name for file in trained.iterdir()} == FILES
     told = json.loads((trained / "config.json").read_text())
     manifest = read_manifest(trained)
     assert manifest and manifest.faults(trained, verify=True) == []
@@ -111,12 +107,7 @@ def test_what_was_begun_with_another_grounding_is_left_alone(
 
 def test_rma_deploys_a_student_that_is_told_no_parameters(task: str, paired: Path, tmp_path: Path) -> None:
     make(task, "rma", paired, None, tmp_path / "train")
-    assert {file.name for file in (tmp_path / "train").iterdir()} == {
-        "config.json",
-        "curve.json",
-        "manifest.json",
-        "policy.safetensors",
-    }
+    assert {file.name for file in (tmp_path / "train").iterdir()} == FILES
     told = json.loads((tmp_path / "train" / "config.json").read_text())
     assert (told["method"], told["settings"]) == ("rma", RMA.model_dump())
     assert told["train"] == json.loads(TRAIN.model_dump_json())

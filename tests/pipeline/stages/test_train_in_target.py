@@ -22,19 +22,8 @@ MEMORY = {"target": None, "full_obs": 0}
 
 
 def make(task: str, row: str, dataset: Path, out: Path, progress: Progress = silent) -> bytes:
-    train(
-        task,
-        row,
-        CONFIG,
-        settings=TargetConfig(num_envs=4, total_steps=4 * 8 * 6, memory_size=MEMORY[row]),
-        dataset=dataset,
-        grounding=None,
-        seed=0,
-        out=out,
-        device="cpu",
-        progress=progress,
-        num_threads=1,
-    )
+    settings = TargetConfig(num_envs=4, total_steps=4 * 8 * 6, memory_size=MEMORY[row])
+    train(task, row, CONFIG, settings=settings, dataset=dataset, out=out, progress=progress, num_threads=1)
     return (out / "policy.safetensors").read_bytes()
 
 
@@ -64,16 +53,5 @@ def test_the_upper_bounds_learn_in_the_target_and_go_on_after_an_interruption(
     assert trained.simulation is None and trained.observed == observed
     assert trained.policy.shape.observation_size == size
     assert trained.policy.shape.memory_size == (CONFIG.memory_size if MEMORY[row] is None else 0)
-    evaluate(
-        task,
-        row,
-        EvaluateConfig(episodes=2),
-        policy=whole,
-        grounding=None,
-        target_encoder=None,
-        seed=0,
-        out=tmp_path / "evaluated",
-        progress=silent,
-        num_threads=1,
-    )
+    evaluate(task, row, EvaluateConfig(episodes=2), policy=whole, out=tmp_path / "evaluated", num_threads=1)
     assert (tmp_path / "evaluated" / "evaluation.json").is_file()

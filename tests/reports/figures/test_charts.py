@@ -4,23 +4,14 @@ from typing import Any
 import numpy as np
 import pytest
 from fake_dataset import write_fake
+from fake_runs import line, results
 from figures_shown import drawn, legend
 
 from astra_data.reports.figures.charts import data_efficiency, learning_curves, on_one_grid, score_bars
 from astra_data.reports.figures.style import Scene
-from astra_data.reports.results import SIMULATED, TESTED, Line, Results, TrainingFacts
+from astra_data.reports.results import SIMULATED, TrainingFacts
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.objective import RETURN, SUCCESS, SURVIVED_STEPS
-
-
-def results(*lines: Line, **changes: object) -> Results:
-    rows = tuple(dict.fromkeys(line.row for line in lines)) or ("nas", "astra", "astra_plus")
-    facts = {"recipe": "r", "task": "t", "command": "c", "rows": rows, "episodes": 4}
-    return Results.model_validate(facts | {"lines": lines} | changes)
-
-
-def line(row: str, seed: int, where: str = TESTED, percent: int = 100, **values: float) -> Line:
-    return Line(row=row, seed=seed, percent=percent, where=where, values=values)
 
 
 @pytest.fixture

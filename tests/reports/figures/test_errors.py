@@ -1,17 +1,18 @@
 from pathlib import Path
 
 import numpy as np
+from fake_runs import line, results
 from figures_shown import legend
 
 from astra_data.reports.figures.charts import open_loop_error, predictive_validity, reliability
 from astra_data.reports.figures.style import Scene, method_color, png
-from astra_data.reports.results import TESTED, Errors, Line, Results
+from astra_data.reports.results import TESTED, Errors, Results
 from astra_data.robots.registry import TASKS
 
 SCENE = Scene(Path(), TASKS["antmaze-umaze"])
 
 
-def results(raw: dict[str, float], *quantities: str) -> Results:
+def with_errors(raw: dict[str, float], *quantities: str) -> Results:
     errors = [
         Errors(
             row=row,
@@ -27,22 +28,22 @@ def results(raw: dict[str, float], *quantities: str) -> Results:
         for simulator, factor in (("raw", 1.0), ("grounded", 0.1))
         for quantity in quantities
     ]
-    return Results(recipe="r", task="t", command="", rows=("nas", "astra", "iql"), episodes=1, errors=errors)
+    return results(rows=("nas", "astra", "iql"), errors=errors)
 
 
 def test_open_loop_error_is_logarithmic_and_draws_a_shared_raw_simulator_once() -> None:
-    figure = open_loop_error(results({"nas": 1.0, "astra": 1.0}, "position_m"), SCENE)
+    figure = open_loop_error(with_errors({"nas": 1.0, "astra": 1.0}, "position_m"), SCENE)
     assert figure is not None
     (axes,) = figure.axes
     assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")
     assert axes.get_ylabel() == "position error (m)" and legend(figure) == ["no grounding", "NAS", "ASTRA"]
     assert np.asarray(axes.lines[0].get_xydata()).tolist() == [[1.0, 1.0], [10.0, 2.0]]
-    assert len(axes.collections) == 3 and open_loop_error(results({}), SCENE) is None
+    assert len(axes.collections) == 3 and open_loop_error(with_errors({}), SCENE) is None
 
 
 def test_raw_simulators_that_differ_are_all_drawn_and_units_follow_from_the_names() -> None:
     names = ("turn_rate_rad_s", "speed_m_s", "push_m_s2", "heading_rad", "tilt_deg", "energy")
-    figure = open_loop_error(results({"nas": 1.0, "astra": 1.005, "iql": 1.03}, *names), SCENE)
+    figure = open_loop_error(with_errors({"nas": 1.0, "astra": 1.005, "iql": 1.03}, *names), SCENE)
     assert figure is not None
     assert [axes.get_ylabel() for axes in figure.axes] == [
         "turn rate error (rad/s)",
@@ -85,8 +86,7 @@ def test_validity_draws_a_dot_per_policy_in_its_methods_color() -> None:
         *(("nas", 0, "raw", 1.0), ("nas", 1, "raw", 2.0), ("astra_plus", 0, "raw", 5.0)),
         ("nas", 0, "grounded", 7.0),
     ]
-    lines = [Line(row=row, seed=seed, where=where, values={"return": one}) for row, seed, where, one in returns]
-    found = Results(recipe="r", task="t", command="", rows=("nas", "astra_plus"), episodes=1, lines=lines)
+    found = results(*(line(row, seed, where, 100, **{"return": one}) for row, seed, where, one in returns))
     figure = predictive_validity(found, SCENE)
     assert figure is not None
     raw, grounded = figure.axes

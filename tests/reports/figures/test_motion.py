@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import fake_runs
 import numpy as np
 import pytest
 import torch
@@ -23,7 +24,7 @@ from astra_data.reports.figures.motion import (
     trajectories,
 )
 from astra_data.reports.figures.style import DEPLOYED, SIMULATED, Scene
-from astra_data.reports.results import TESTED, Line, Results
+from astra_data.reports.results import Results
 from astra_data.robots.nao.tasks import NaoEnv
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.plane.mazes import U_MAZE
@@ -33,10 +34,8 @@ from astra_data.worlds.user_code import user_object
 CART = Path(__file__).parents[3] / "recipes/examples/cart/cart.py"
 
 
-def results(*rows: str, **changes: object) -> Results:
-    lines = [Line(row=row, seed=0, where=TESTED, values={"success": 1 / 3}) for row in rows]
-    facts = {"recipe": "r", "task": "t", "command": "c", "rows": rows, "episodes": 3, "lines": lines}
-    return Results.model_validate(facts | changes)
+def results(*rows: str) -> Results:
+    return fake_runs.results(*(fake_runs.line(row, 0, success=1 / 3) for row in rows))
 
 
 def paths() -> NDArray[np.float64]:

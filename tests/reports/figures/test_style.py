@@ -4,6 +4,7 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 import pytest
+from fake_runs import line, results
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.image import imread
@@ -11,16 +12,14 @@ from matplotlib.image import imread
 from astra_data.methods import METHODS
 from astra_data.reports.figures.charts import score_bars
 from astra_data.reports.figures.style import Scene, coverage, method_color, png, style
-from astra_data.reports.results import TESTED, Line, Results
 from astra_data.robots.registry import TASKS
 
 ROWS = ("direct_transfer", "nas", "astra", "direct_transfer_plus", "nas_plus", "astra_plus", "follower")
 
 
 def bars(*rows: str) -> Figure:
-    lines = [Line(row=row, seed=0, where=TESTED, values={"success": 0.5}) for row in rows]
-    results = Results(recipe="r", task="t", command="", rows=rows, episodes=1, lines=lines)
-    figure = score_bars(results, Scene(Path(), TASKS["antmaze-umaze"]), measure="success")
+    found = results(*(line(row, 0, success=0.5) for row in rows))
+    figure = score_bars(found, Scene(Path(), TASKS["antmaze-umaze"]), measure="success")
     assert figure is not None
     return figure
 
