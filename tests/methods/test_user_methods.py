@@ -94,7 +94,7 @@ def test_a_delta_action_finds_what_was_added_to_the_commands(tmp_path: Path, sim
 
 def test_each_member_of_an_ensemble_learns_the_correction_and_an_episode_keeps_its_member(tmp_path: Path) -> None:
     method = user_object(f"{EXAMPLES / 'gru_ensemble.py'}:METHOD")
-    given = fitting(tmp_path, moved_by=0.0)
+    given = replace(fitting(tmp_path), config=GroundConfig(updates=100))
     windows = given.training.windows
     windows.next_state = windows.simulated_next + 0.3 * windows.state - 0.1 * windows.action  # type: ignore[misc]
     grounding, _ = method.fit(given)
