@@ -151,7 +151,7 @@ class DatasetWriter:
         """
         if not self._is_open:
             raise BadInputError(f"{self.root}: add episodes inside `with DatasetWriter(...) as writer:`.")
-        self._admission.admit(episode)
+        self._admission.check(episode)
         length = len(episode)
         pictures: dict[str, Any] = {}
         for name, clip in episode.cameras.items() if self._cameras else ():
@@ -164,6 +164,7 @@ class DatasetWriter:
                     raise CorruptDatasetError(f"{error}: {advice}") from None
                 place = (*divmod(span.file, layout.CHUNK_SIZE), span.from_s, span.to_s)
                 pictures |= {f"videos/{name}/{key}": x for key, x in zip(layout.VIDEO_PLACE, place, strict=True)}
+        self._admission.keep(episode)
         values = {name: episode.columns[name] for name in self._columns} | layout.reserved_values(
             length, uid=episode.uid, episode=len(self._lengths), start=self._frames, fps=self._fps
         )
@@ -254,16 +255,18 @@ class Admission:
         self._uids: set[int] = set()
         self.metadata_types: dict[str, type] = {}  # of each metadata key seen so far
 
-    def admit(self, episode: Episode, *, keep: bool = True) -> None:
-        """Accept `episode`, or refuse it with a BadInputError that lists every fault; `keep` it in mind."""
+    def check(self, episode: Episode) -> None:
+        """Refuse `episode` with a BadInputError that lists every fault, if it has any."""
         if not isinstance(episode, Episode):
             kind = type(episode).__name__
             raise BadInputError(f"expected an Episode, made with Episode(uid, columns), got a {kind}")
         if faults := self._faults(episode):
             raise BadInputError(f"Episode {episode.uid}: {'; '.join(faults)}.")
-        if keep:
-            self._uids.add(episode.uid)
-            self.metadata_types |= {key: type(value) for key, value in episode.metadata.items()}
+
+    def keep(self, episode: Episode) -> None:
+        """Let those that follow be checked against `episode`, too."""
+        self._uids.add(episode.uid)
+        self.metadata_types |= {key: type(value) for key, value in episode.metadata.items()}
 
     def _faults(self, episode: Episode) -> list[str]:
         faults = [f"{name}: missing" for name in self._columns if name not in episode.columns]
@@ -378,9 +381,10 @@ class StagedWriter:
             for path in self._paths():
                 episode = load_staged(path, self._columns)
                 try:
-                    self._admission.admit(episode)
+                    self._admission.check(episode)
                 except BadInputError as error:
                     raise BadInputError(f"{path}: {error} Delete it and resume the recording.") from error
+                self._admission.keep(episode)
                 self.staged[int(path.stem)], self.lengths[int(path.stem)] = episode.metadata, len(episode)
             self._exit = stack.pop_all()
         self._is_open = True
@@ -425,14 +429,14 @@ class StagedWriter:
         place = max(self.staged, default=-1) + 1 if position is None else position
         if place in self.staged:
             raise BadInputError(f"Episode {episode.uid}: there is an episode {place} already.")
-        self._admission.admit(episode, keep=False)
+        self._admission.check(episode)
         path = self._path(place)
         partial = path.with_suffix(".partial")
         with self._keeping(), durable.writing(path):
             write_staged(partial, episode, self._schema)
             durable.sync(partial)
             durable.move(partial, path)
-        self._admission.admit(episode)
+        self._admission.keep(episode)
         self.staged[place], self.lengths[place] = episode.metadata, len(episode)
 
     def drop(self, position: int) -> None:

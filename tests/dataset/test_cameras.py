@@ -247,5 +247,13 @@ def test_what_does_not_fit_is_refused(source: Dataset, tmp_path: Path) -> None:
         merge([source, Dataset.open(tmp_path / "blind")], out=tmp_path / "out")
     beyond = Clip(clips[FRONT].path, FRONT, 2.5, 1 / FPS, 9)
     assert "no frame at" in str(clip_fault(beyond)) and clip_fault(clips[FRONT]) is None
+    with writer(tmp_path / "again", cameras=FEATURES) as opened:
+        unreadable = {FRONT: beyond, TOP: clips[TOP].part(0, 9)}
+        with pytest.raises(CorruptDatasetError, match="no frame at"):
+            opened.add(replace(fake_episode(3, 9), cameras=unreadable, metadata={"floor": 1}))
+        opened.add(replace(fake_episode(3, 14), cameras=clips, metadata={"floor": "wood"}))
+    [whole] = Dataset.open(tmp_path / "again").episodes()
+    assert whole.metadata["floor"] == "wood"
+    np.testing.assert_array_equal(decoded(whole.cameras[FRONT]), decoded(clips[FRONT]))
     single = Clip(film(tmp_path / "single.mp4", 1), FRONT, 0.0, 1 / FPS, 1)
     assert decoded(single).shape == (1, 64, 64, 3) and clip_fault(replace(single, count=2)) is not None

@@ -201,11 +201,11 @@ def test_only_the_last_step_ends_an_episode(tmp_path: Path, name: str, frame: in
 
 def test_metadata_keys_keep_the_type_of_their_first_value() -> None:
     admission = Admission(COLUMNS)
-    admission.admit(Episode(1, fake_columns(3, seed=1), {"success": True}))
-    admission.admit(Episode(2, fake_columns(3, seed=2), {"return": 0.5}))
+    admission.keep(Episode(1, fake_columns(3, seed=1), {"success": True}))
+    admission.keep(Episode(2, fake_columns(3, seed=2), {"return": 0.5}))
     assert admission.metadata_types == {"success": bool, "return": float}
     with pytest.raises(BadInputError, match="metadata success: int, earlier episodes have bool"):
-        admission.admit(Episode(3, fake_columns(3, seed=3), {"success": 1}))
+        admission.check(Episode(3, fake_columns(3, seed=3), {"success": 1}))
 
 
 @pytest.mark.parametrize(
