@@ -20,9 +20,8 @@ from astra_data.core.durable import file_digest
 from astra_data.core.errors import AstraDataError, BadInputError
 from astra_data.dataset.description import read_description
 from astra_data.pipeline.executors import EXECUTORS, Item, Watch
+from astra_data.pipeline.plan import ARTIFACTS
 from astra_data.pipeline.stages.registry import STAGES, Stage
-
-ARTIFACTS = ("dataset", "policy", "grounding", "target_encoder", "reference", "initial")
 
 
 class FakeStages:

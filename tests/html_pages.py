@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from html.parser import HTMLParser
 
 VOID = {"meta", "link", "img", "rect", "path", "br"}
+HEADINGS = {"h1", "h2", "h3"}
 
 
 @dataclass
@@ -12,15 +13,18 @@ class Page(HTMLParser):
 
     Attributes:
         tables: the paragraph or heading above → lines of cells, the head first.
+        sections: heading → lines of cells of the tables below it, likewise.
         tags: name and attributes of each element, in order.
         words: all text outside of styles.
     """
 
     tables: dict[str, list[list[str]]] = field(default_factory=dict)
+    sections: dict[str, list[list[str]]] = field(default_factory=dict)
     tags: list[tuple[str, dict[str, str | None]]] = field(default_factory=list)
     words: str = ""
     _open: list[str] = field(default_factory=list)
     _above: str = ""
+    _line: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         super().__init__()
@@ -30,26 +34,30 @@ class Page(HTMLParser):
         self.tags.append((tag, values))
         if tag not in VOID:
             self._open.append(tag)
-        if tag in ("p", "h2", "h3"):
+        if tag in {"p", *HEADINGS} and "table" not in self._open:
             self._above = ""
         elif tag == "tr":
-            self.tables.setdefault(self._above, []).append([])
+            self._line = []
+            for lines in (self.tables.setdefault(self._above, []), *[*self.sections.values()][-1:]):
+                lines.append(self._line)
         elif tag in ("td", "th"):
-            self.tables[self._above][-1].append("")
+            self._line.append("")
 
     def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.tags.append((tag, dict(attrs)))
 
     def handle_endtag(self, tag: str) -> None:
         assert self._open.pop() == tag, f"</{tag}> closes another element"
+        if tag in HEADINGS:
+            self.sections[" ".join(self._above.replace("¶", "").split())] = []
 
     def handle_data(self, data: str) -> None:
         if "style" in self._open:
             return
         self.words += data
         if "td" in self._open or "th" in self._open:
-            self.tables[self._above][-1][-1] += data
-        elif {"p", "h2", "h3"} & {*self._open}:
+            self._line[-1] += data
+        elif {"p", *HEADINGS} & {*self._open}:
             self._above += data
 
     def attributes(self, tag: str) -> list[dict[str, str | None]]:

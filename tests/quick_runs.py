@@ -7,7 +7,7 @@ import pytest
 
 from astra_data.grounding.descent import DescentConfig
 from astra_data.pipeline.experiment import load_experiment
-from astra_data.pipeline.plan import Selection, plan, stages_until
+from astra_data.pipeline.plan import plan, selected, stages_until
 
 
 def small_tables(*, held_out_share: float, episodes: int, train: str = "") -> str:
@@ -44,7 +44,7 @@ def run_here(path: Path, until: str | None = None, device: str = "cpu", seeds: S
     experiment, stages = load_experiment(path, path.parent / "runs"), stages_until(until)
     experiment.folder.mkdir(parents=True)
     (experiment.folder / "recipe.json").write_text(experiment.recipe.model_dump_json())
-    part = Selection.of(experiment.recipe, seeds=seeds)
+    part = selected(experiment.recipe, seeds=seeds)
     for item in plan(experiment.recipe, path, experiment.folder, part, device=device):
         if item.stage in stages:
             item.call()

@@ -5,33 +5,18 @@ import shutil
 from pathlib import Path
 
 import pytest
-from quick_runs import fit_quickly, run_here
+from quick_runs import fit_quickly, run_here, small_tables
 from shared_runs import shared
 
 ROOT = Path(__file__).parents[1]
-SMALL = """
+COLLECT = """
 [collect]
 episodes = 8
 max_steps = 40
 start = "task"
 hold_s = [0.1, 0.4]
-[ground]
-updates = 3
-window = 5
-held_out_share = 0.25
-[train]
-num_envs = 4
-rollout_steps = 8
-total_steps = 32
-hidden_sizes = [8]
-memory_size = 4
-[align]
-updates = 2
-batch_windows = 2
-window = 5
-[evaluate]
-episodes = 3
 """
+SMALL = COLLECT + small_tables(held_out_share=0.25, episodes=3)
 
 
 def write_recipe(place: Path, *, seeds: str = "[0, 1, 2]", methods: str = "", more: str = "") -> Path:

@@ -11,7 +11,7 @@ from astra_data.core.progress import Progress, silent
 from astra_data.grounding.files import GROUNDING, grounding_at
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.methods import method_named
-from astra_data.pipeline.plan import ARTIFACTS, Selection, plan
+from astra_data.pipeline.plan import ARTIFACTS, plan, selected
 from astra_data.pipeline.recipe import Recipe
 from astra_data.pipeline.trained_policy import settings_of
 from astra_data.pipeline.user_code import add_all
@@ -117,7 +117,7 @@ def _planned(
 ) -> partial[object]:
     """Return the call by which a run with these `settings` makes the artifact of a row of others."""
     recipe = validated(settings | {"select": None}, Recipe, f"{run}")
-    only = Selection.of(recipe, (row,), (seed,), () if percent is None else (percent,))
+    only = selected(recipe, (row,), (seed,), () if percent is None else (percent,))
     items = {item.key: item.call for item in plan(recipe, Path(f"{run}.toml"), Path(run), only)}
     call = items.get(artifact_key(stage, row, seed, percent))
     if not isinstance(call, partial):

@@ -13,7 +13,7 @@ import inspect
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from itertools import product, takewhile
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -29,45 +29,29 @@ from astra_data.pipeline.recipe import Recipe
 from astra_data.pipeline.stages.registry import STAGES, Stage
 from astra_data.pipeline.stages.select import benches, judge_of
 from astra_data.pipeline.user_code import digests_of
-from astra_data.reports.runs import Owner, Reported
+from astra_data.reports.runs import Reported, Selection
 from astra_data.robots.registry import task_named
 
 ARTIFACTS = ("dataset", "policy", "grounding", "target_encoder", "reference", "initial")  # folders, as parameters
 
 
-@dataclass(frozen=True)
-class Selection:
-    """Rows, seeds and sizes of a recipe; `percents` is empty where the recipe has no sizes."""
-
-    methods: tuple[str, ...]
-    seeds: tuple[int, ...]
-    percents: tuple[int, ...]
-
-    @classmethod
-    def of(
-        cls, recipe: Recipe, methods: Sequence[str] = (), seeds: Sequence[int] = (), percents: Sequence[int] = ()
-    ) -> "Selection":
-        """Return those that are named; of an axis on which nothing is named, all."""
-        for method in methods:
-            if method not in recipe.methods:
-                hint = did_you_mean(method, recipe.methods)
-                raise BadInputError(f"the recipe has no method '{method}'{hint}")
-        sizes = recipe.sweep.percent
-        for what, asked, known in (("seed", seeds, recipe.seeds), ("size", percents, sizes)):
-            if unknown := [value for value in asked if value not in known]:
-                listed = ", ".join(map(str, known)) or "none"
-                raise BadInputError(f"the recipe has no {what} {unknown[0]}; its {what}s: {listed}")
-        return cls(
-            tuple(dict.fromkeys(methods)) or recipe.methods,
-            tuple(dict.fromkeys(seeds)) or recipe.seeds,
-            tuple(dict.fromkeys(percents)) or sizes,
-        )
-
-    def points(self) -> dict[str, Owner]:
-        """Return every row on every size of every seed, by the key of its evaluation, which is made last."""
-        points = product(self.methods, self.percents or (None,), self.seeds)
-        owners = [Owner(row, seed, percent) for row, percent, seed in points]
-        return {artifact_key("evaluate", *owner): owner for owner in owners}
+def selected(
+    recipe: Recipe, methods: Sequence[str] = (), seeds: Sequence[int] = (), percents: Sequence[int] = ()
+) -> Selection:
+    """Return those of a recipe that are named; of an axis on which nothing is named, all."""
+    for method in methods:
+        if method not in recipe.methods:
+            raise BadInputError(f"the recipe has no method '{method}'{did_you_mean(method, recipe.methods)}")
+    sizes = recipe.sweep.percent
+    for what, asked, known in (("seed", seeds, recipe.seeds), ("size", percents, sizes)):
+        if unknown := [value for value in asked if value not in known]:
+            listed = ", ".join(map(str, known)) or "none"
+            raise BadInputError(f"the recipe has no {what} {unknown[0]}; its {what}s: {listed}")
+    return Selection(
+        tuple(dict.fromkeys(methods)) or recipe.methods,
+        tuple(dict.fromkeys(seeds)) or recipe.seeds,
+        tuple(dict.fromkeys(percents)) or sizes,
+    )
 
 
 def plan(
@@ -85,7 +69,7 @@ def plan(
 
     A `selection` is made; what the report is of, `reports`, is by default all that is finished of the recipe.
     """
-    selection, reports = selection or Selection.of(recipe), reports or Selection.of(recipe)
+    selection, reports = selection or selected(recipe), reports or selected(recipe)
     items = list(_Plan(recipe, folder, selection, device).items())
     keys = tuple(selection.points())
     about: dict[str, Any] = {"name": path.stem, "task": recipe.task, "settings": recipe.settings}
@@ -227,7 +211,8 @@ class _Plan:
     def _artifacts(self, stage: Stage, seed: int, percent: int | None, name: str) -> dict[str, str | None]:
         """Return the keys of the artifacts that a stage may read, by its parameters."""
         before = takewhile(lambda one: one is not stage, STAGES.values())
-        *_, last = (None, *(one for one in before if one.makes_dataset and self._has(one)))
+        datasets = [one for one in before if one.makes_dataset and self._has(one)]
+        last = datasets[-1] if datasets else None
         size = percent if last and last.each == "size" else None
         artifacts = {"dataset": artifact_key(last.name, "", seed, size) if last else None}
         if not name:

@@ -31,7 +31,7 @@ from astra_data.pipeline.experiment import (
     load_experiment,
     to_make_again,
 )
-from astra_data.pipeline.plan import Selection, check_stage, plan, stages_until
+from astra_data.pipeline.plan import check_stage, plan, selected, stages_until
 from astra_data.pipeline.shipped import is_shipped
 from astra_data.pipeline.stages.registry import STAGES
 from astra_data.pipeline.user_code import UserMethod, add_all, digests_of
@@ -39,7 +39,7 @@ from astra_data.reports.artifacts import CURVE, EVALUATION, METRICS, Artifact, E
 from astra_data.reports.diagnosis import DIAGNOSIS, diagnosis_page
 from astra_data.reports.held_out import write_held_out
 from astra_data.reports.results import WHOLE
-from astra_data.reports.runs import Owner, recorded_code
+from astra_data.reports.runs import Owner, Selection, recorded_code
 from astra_data.robots.registry import TASKS, task_named
 from astra_data.worlds.walk_through import check_task
 
@@ -93,7 +93,7 @@ def run(
     stages = stages_until(until)
     experiment = load_experiment(recipe_path, root)
     wanted = stages - experiment.borrowed
-    part = Selection.of(experiment.recipe, methods, seeds, percents)
+    part = selected(experiment.recipe, methods, seeds, percents)
     planned = plan(experiment.recipe, recipe_path, experiment.folder, part, device=device)
     items = [item for item in planned if item.stage in wanted]
     make(experiment, items, planned, jobs=jobs, device=device, engine=engine, address=address, points=part.points())
@@ -155,7 +155,7 @@ def run_stage(
     recipe, folder = experiment.recipe, experiment.folder
     if stage == "collect" and recipe.data is not None:
         raise BadInputError(f"{recipe_path} uses the data {recipe.data}: there is nothing to collect")
-    selection, results = Selection.of(recipe, methods, seeds), experiment.results if publish else None
+    selection, results = selected(recipe, methods, seeds), experiment.results if publish else None
     published = experiment.published() if publish else ()
     planned = plan(
         recipe, recipe_path, folder, selection, device=device, reports=selection, publish=results, published=published
@@ -308,7 +308,7 @@ def _selected(items: tuple[Item, ...], stage: str, methods: Sequence[str]) -> li
 
 def _write_points(experiment: Experiment) -> dict[str, dict[str, Any]]:
     """Write the lines of all points that are finished now, if there are any, to `sweep.csv`, and return them."""
-    points = Selection.of(experiment.recipe).points().items()
+    points = selected(experiment.recipe).points().items()
     lines = {key: _line(experiment, key, one) for key, one in points if (experiment.folder / key).is_dir()}
     if lines:
         text = StringIO()

@@ -19,7 +19,7 @@ from astra_data.grounding.files import load_grounding
 from astra_data.grounding.open_loop import replay_open_loop
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.simulator import NO_GROUNDING, Grounding
-from astra_data.pipeline.plan import Selection, plan
+from astra_data.pipeline.plan import plan, selected
 from astra_data.pipeline.recipe import Recipe
 from astra_data.pipeline.stages.registry import STAGES
 from astra_data.pipeline.trained_policy import settings_of
@@ -37,7 +37,7 @@ def view_run(run: Path, uids: Sequence[int] = (), *, seed: int | None = None, sa
         raise BadInputError(f"--save {save}: expected a file that ends in .rrd")
     recipe = validated(settings_of(run), Recipe, f"{run}")
     seeds = recipe.seeds[:1] if seed is None else (seed,)
-    selection = Selection.of(recipe, seeds=seeds, percents=sorted(recipe.sweep.percent)[-1:])
+    selection = selected(recipe, seeds=seeds, percents=sorted(recipe.sweep.percent)[-1:])
     items = plan(recipe, Path(f"{run}.toml"), run, selection)
     pairs = next(run / item.key for item in items if item.stage == "pair")
     if not pairs.is_dir():

@@ -112,11 +112,6 @@ class Candidate(WrittenPart):
     success: dict[int, float] = Field(min_length=1)  # seed of the judge → share of the episodes
 
     @property
-    def key(self) -> tuple[str, int, int | None]:
-        """What makes it unique."""
-        return (self.row, self.seed, self.percent)
-
-    @property
     def name(self) -> str:
         """What it is called on a page."""
         return f"{method_title(self.row)}, seed {self.seed}"

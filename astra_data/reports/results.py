@@ -299,7 +299,7 @@ def merge(sources: Sequence[Results]) -> Results:
         part: [*{one.key: one for source in sources for one in getattr(source, part)}.values()]
         for part in ("lines", "errors", "trainings")
     }
-    candidates = {one.key: one for of in judged for one in of.candidates}
+    candidates = {(one.row, one.seed, one.percent): one for of in judged for one in of.candidates}
     return last.model_copy(
         update={
             "rows": tuple(dict.fromkeys([*last.rows, *(row for one in sources for row in one.rows)])),

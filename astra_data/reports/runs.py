@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import product
 from math import isnan
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,18 +23,6 @@ DATASET_STAGES = ("collect", "label", "augment", "pair", "subset")  # they write
 SHARED_WORLDS = ("raw", "grounded")  # simulators in which all methods are tested
 
 
-@dataclass(frozen=True, kw_only=True)
-class Reported:
-    """What stages of a whole recipe need of it, small enough to be sent to another process."""
-
-    name: str
-    task: str
-    methods: tuple[str, ...]
-    seeds: tuple[int, ...]
-    settings: Mapping[str, JsonValue]
-    percents: tuple[int, ...] = ()
-
-
 def recorded_code(root: Path) -> dict[str, str]:
     """Return what the run at `root` recorded of the user's code and its settings; empty where it has none."""
     if not (root / CODE).is_file():
@@ -52,6 +41,30 @@ class Owner(NamedTuple):
     def facts(self) -> dict[str, Any]:
         """Return it as fields of `OfSeed`."""
         return self._asdict() | {"percent": results.WHOLE if self.percent is None else self.percent}
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Rows, seeds and sizes of a recipe; `percents` is empty where the recipe has no sizes."""
+
+    methods: tuple[str, ...]
+    seeds: tuple[int, ...]
+    percents: tuple[int, ...] = ()
+
+    def points(self) -> dict[str, Owner]:
+        """Return every row on every size of every seed, by the key of its evaluation, which is made last."""
+        points = product(self.methods, self.percents or (None,), self.seeds)
+        owners = [Owner(row, seed, percent) for row, percent, seed in points]
+        return {artifact_key("evaluate", *owner): owner for owner in owners}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reported(Selection):
+    """What stages of a whole recipe need of it, small enough to be sent to another process."""
+
+    name: str
+    task: str
+    settings: Mapping[str, JsonValue]
 
 
 class RunReader:

@@ -30,9 +30,7 @@ EXAMPLES = ROOT / "recipes/examples/methods"
 ANTS = TASKS["antmaze-umaze"]
 CARTS = user_object(f"{ROOT}/recipes/examples/cart/cart.py:TASK")
 pytestmark = pytest.mark.usefixtures("forgotten_methods")
-SMALL = RAIL.replace("memory_size = 4", "memory_size = 4\ntries = 1").replace(
-    'max_steps = 40\nstart = "task"', "max_steps = 12"
-)
+SMALL = RAIL.replace('max_steps = 40\nstart = "task"', "max_steps = 12")
 
 
 def recipe(folder: Path, methods: str, own: str) -> Path:

@@ -6,7 +6,7 @@ import pytest
 
 from astra_data.core.config import load_recipe
 from astra_data.core.errors import BadInputError, RecipeError
-from astra_data.pipeline.plan import ARTIFACTS, Selection, plan, stages_until
+from astra_data.pipeline.plan import ARTIFACTS, plan, selected, stages_until
 from astra_data.pipeline.recipe import Recipe
 from astra_data.pipeline.stages.registry import STAGES
 
@@ -78,7 +78,7 @@ def test_rows_are_made_of_every_size(tmp_path: Path) -> None:
 
 def test_a_part_of_a_sweep_collects_as_much_as_the_whole(tmp_path: Path) -> None:
     recipe = load(tmp_path, HEAD + "[sweep]\npercent = [50, 150]\n")
-    part = Selection.of(recipe, methods=["astra"], seeds=[7], percents=[50])
+    part = selected(recipe, methods=["astra"], seeds=[7], percents=[50])
     items = {item.key: item for item in plan(recipe, tmp_path / "r.toml", tmp_path, part, reports=part)}
     assert list(items) == [
         "collect/seed_7",
@@ -166,9 +166,9 @@ def test_a_choice_reads_all_policies_and_groundings_that_it_needs(tmp_path: Path
 def test_rows_without_policies_to_judge_are_reported_without_a_choice(tmp_path: Path) -> None:
     recipe = load(tmp_path, SELECT)
     for part in (
-        Selection.of(recipe, methods=["follower"]),
-        Selection.of(recipe, methods=["target"]),
-        Selection.of(recipe, seeds=[7]),  # one seed alone is not judged
+        selected(recipe, methods=["follower"]),
+        selected(recipe, methods=["target"]),
+        selected(recipe, seeds=[7]),  # one seed alone is not judged
     ):
         items = {item.key: item for item in plan(recipe, tmp_path / "r.toml", tmp_path, part)}
         assert "select" not in items and "select" not in items["report"].inputs
@@ -176,7 +176,7 @@ def test_rows_without_policies_to_judge_are_reported_without_a_choice(tmp_path: 
 
 def test_the_judge_is_grounded_even_if_its_row_is_left_out(tmp_path: Path) -> None:
     recipe = load(tmp_path, SELECT.replace("episodes = 3", 'judge = "astra_plus"'))
-    part = Selection.of(recipe, methods=["direct_transfer"])
+    part = selected(recipe, methods=["direct_transfer"])
     items = {item.key: item for item in plan(recipe, tmp_path / "r.toml", tmp_path, part)}
     assert "ground/astra/seed_7" in items and "ground/astra/seed_7" in items["select"].inputs
     assert "ground/nas/seed_7" not in items["select"].inputs

@@ -34,7 +34,7 @@ def push(
     Args:
         dataset: a folder, name@data-1.2.0, or name for the newest at home.
         destination: "user/name" or "hf://datasets/user/name" on the Hugging Face Hub, or any URL that fsspec
-            knows, below which <name>/data-<version>/ is made.
+            knows, below which `<name>/data-<version>/` is made.
         notes: TOML file with the hand-written part of the card, see `Notes`.
         private: create the repository on the Hub as private, and refuse one that is public.
         progress: called with the fraction done.

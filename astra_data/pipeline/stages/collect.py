@@ -48,12 +48,6 @@ _SAC_STEPS, _SAC_EPISODE_STEPS = 300_000, 500  # steps of the training; it stops
 MOST_STEPS = 10**10  # upper bound of the steps of a dataset; it would take terabytes
 
 
-def held_steps(hold_s: HoldTimes, timestep_s: float) -> tuple[int, int]:
-    """Return the fewest and the most control steps for which a command is held."""
-    shortest, longest = (max(1, round(seconds / timestep_s)) for seconds in hold_s)
-    return shortest, longest
-
-
 class WallWatch:
     """Predicts with the abstract simulator how close to walls commands lead within a second."""
 
@@ -80,11 +74,12 @@ class RandomCommands:
         """Hold commands (A,) for `hold_steps` (fewest, most), or until `watch` predicts a wall."""
         self._size, self._hold_steps, self._watch = action_size, hold_steps, watch
 
-    def start(self, rows: range, seed: int) -> None:
-        """Begin new episodes of as many robots as `rows`."""
+    def begin(self, count: int, seed: int) -> Act:
+        """Begin new episodes of so many robots; return what acts in them."""
         self._rng = generator(seed, "behavior")
-        self._command = np.zeros((len(rows), self._size))
-        self._left = np.zeros(len(rows), dtype=int)
+        self._command = np.zeros((count, self._size))
+        self._left = np.zeros(count, dtype=int)
+        return self.act
 
     def act(self, state: Tensor, goal: Tensor) -> Tensor:
         """Return commands (B, A); goals are ignored, and so are states unless walls are watched for."""
@@ -127,28 +122,19 @@ class StressCommands(RandomCommands):
         return drawn.astype(np.int64).clip(fewest, most)
 
 
-class PolicyBehavior:
-    """A policy that draws its actions from its distribution, as it does in training."""
-
-    def __init__(self, running: RunningPolicy) -> None:
-        self._running = running
-
-    def start(self, rows: range, seed: int) -> None:
-        """Begin new episodes of as many robots as `rows`."""
-        self._running.start(len(rows), torch.Generator().manual_seed(derive(seed, "behavior")))
-
-    def act(self, state: Tensor, goal: Tensor) -> Tensor:
-        """Return actions (B, A) for target states (B, S) and goals (B, G)."""
-        return self._running.act(state, goal)
+def begin_drawing(policy: RunningPolicy, count: int, seed: int) -> Act:
+    """Begin new episodes of a policy that draws its actions from its distribution, as it does in training."""
+    policy.start(count, torch.Generator().manual_seed(derive(seed, "behavior")))
+    return policy.act
 
 
-Behavior = RandomCommands | PolicyBehavior
+Behavior = Callable[[int, int], Act]  # begins so many new episodes with a seed, and returns what acts in them
 
 
 def record(
     task: Task,
     env: TargetEnv,
-    behavior: Behavior,
+    act: Act,
     rows: range,
     writer: StagedWriter,
     *,
@@ -161,7 +147,7 @@ def record(
     columns, steps = dict[str, Array](), 0
     for step in range(max_steps):
         state, goal = env.state, env.goal.clone()
-        action = behavior.act(state, goal)
+        action = act(state, goal)
         outcome = env.step(action, active)
         ended = outcome.terminated
         truncated = torch.full_like(ended, step == max_steps - 1) & ~ended
@@ -194,13 +180,11 @@ def record(
 
 type Judge = Callable[[Mapping[str, float]], tuple[float, str]]
 """Given the figures of an iteration, returns the share done and a note."""
-type Metadata = dict[str, Any]
-"""What a dataset records about the behavior."""
 
 
 def suboptimal_by_ppo(
     task: Task, *, steps: int, seed: int, folder: Path, num_threads: int | None, progress: Progress
-) -> tuple[PolicyFile, Metadata]:
+) -> tuple[PolicyFile, dict[str, Any]]:
     """Train a policy without memory on φ of the target's state, for `steps`; resume from a checkpoint in `folder`."""
     from astra_data.policies.networks import ActorCritic, PolicyShape
 
@@ -214,7 +198,7 @@ def suboptimal_by_ppo(
 
 def suboptimal_by_sac(
     task: Task, *, steps: int, episode_steps: int, seed: int, folder: Path, num_threads: int | None, progress: Progress
-) -> tuple[PolicyFile, Metadata]:
+) -> tuple[PolicyFile, dict[str, Any]]:
     """Train one on the full state, until episodes last `episode_steps` on average, or for `steps`."""
     from astra_data.policies.networks import PolicyShape, SoftActor
 
@@ -236,7 +220,7 @@ def suboptimal_by_sac(
 
 def _trained(
     learner: Ppo | Sac, world: ObservedTargetEnv, judge: Judge, folder: Path, progress: Progress, observed: Observed
-) -> tuple[PolicyFile, Metadata]:
+) -> tuple[PolicyFile, dict[str, Any]]:
     """Train until `judge`, given the figures of an iteration, returns a share done of 1, with a note."""
 
     def go_on(state: dict[str, Any]) -> None:
@@ -261,11 +245,10 @@ def _trained(
 
 def _lasts(running: RunningPolicy, seed: int, num_threads: int | None) -> float:
     """Return how many steps episodes of the policy last on average: more than those of its training."""
-    behavior, starts = PolicyBehavior(running), derive(seed, "starts")
+    starts = derive(seed, "starts")
 
     def begin(goal: Tensor) -> Act:
-        behavior.start(range(len(goal)), seed)
-        return behavior.act
+        return begin_drawing(running, len(goal), seed)
 
     tested = in_target(running.task, begin, _TEST_EPISODES, starts, num_threads=num_threads)
     return fmean(tested.outcome.steps)
@@ -393,9 +376,9 @@ def _record(
         drawn = derive(batch_seed, "collect")
         env = world.target(len(rows), seed=drawn, start_anywhere=anywhere, num_threads=num_threads)
         env.reset()
-        behavior.start(rows, batch_seed)
+        act = behavior(len(rows), batch_seed)
         shown = part(progress, rows.start / config.episodes, rows.stop / config.episodes)
-        steps += record(world, env, behavior, rows, writer, max_steps=config.max_steps, seed=seed, progress=shown)
+        steps += record(world, env, act, rows, writer, max_steps=config.max_steps, seed=seed, progress=shown)
     return steps
 
 
@@ -418,7 +401,8 @@ def _behavior(
     """Return the behavior and its metadata; a policy trained for it is stored in the dataset."""
     if commands := {"random": RandomCommands, "stress": StressCommands}.get(config.behavior):
         watch = WallWatch(task, config.clearance_m) if config.clearance_m else None
-        return commands(task.objective.action_size, held_steps(config.hold_s, task.timestep_s), watch), {}
+        fewest, most = (max(1, round(seconds / task.timestep_s)) for seconds in config.hold_s)
+        return commands(task.objective.action_size, (fewest, most), watch).begin, {}
     by = partial(suboptimal_by_sac, steps=_SAC_STEPS, episode_steps=_SAC_EPISODE_STEPS)
     if config.behavior == "suboptimal_ppo":
         by = partial(suboptimal_by_ppo, steps=config.ppo_steps)
@@ -426,4 +410,4 @@ def _behavior(
     writer.policy = writer.folder / POLICY
     policy.save(writer.policy)
     metadata["policy_sha256"] = file_digest(writer.policy)
-    return PolicyBehavior(running(task, policy)), metadata
+    return partial(begin_drawing, running(task, policy)), metadata

@@ -3,7 +3,6 @@
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import product
 from pathlib import Path
 
 from pydantic import Field, field_validator
@@ -11,7 +10,6 @@ from pydantic import Field, field_validator
 from astra_data.core.artifact import finished_folder
 from astra_data.core.config import Config, Share, as_fault
 from astra_data.core.durable import file_digest, write_file
-from astra_data.core.naming import artifact_key
 from astra_data.core.progress import Progress, silent
 from astra_data.methods import method_named
 from astra_data.reports.artifacts import EVALUATION
@@ -105,7 +103,5 @@ def _added_to(published: Sequence[Path], found: Results) -> Results:
 
 
 def _digests(recipe: Reported, root: Path) -> dict[str, str]:
-    points = product(recipe.methods, recipe.percents or (None,), recipe.seeds)
-    keys = [artifact_key("evaluate", row, seed, percent) for row, percent, seed in points]
-    read = {key: root / key / EVALUATION for key in keys} | {FOLDER: root / FOLDER / SELECTED}
+    read = {key: root / key / EVALUATION for key in recipe.points()} | {FOLDER: root / FOLDER / SELECTED}
     return {key: file_digest(file) for key, file in read.items() if file.exists()}

@@ -45,10 +45,9 @@ def nearest(behavior: RandomCommands) -> float:
     """Return the least clearance in m of robots that do exactly as they are told for a minute."""
     simulator = TASK.simulator(len(STARTS))
     simulator.reset_to(torch.cat([STARTS, torch.zeros_like(STARTS)], dim=-1))
-    behavior.start(range(len(STARTS)), seed=0)
-    least = np.inf
+    act, least = behavior.begin(len(STARTS), seed=0), np.inf
     for _ in range(310):
-        action = behavior.act(believed(simulator.state[:, :2]), torch.zeros(len(STARTS), 2))
+        action = act(believed(simulator.state[:, :2]), torch.zeros(len(STARTS), 2))
         position = simulator.step(action)[:, :2].double().numpy()
         least = min(least, TASK.maze.clearance(position).min())
     return least
@@ -67,32 +66,23 @@ def test_commands_that_are_watched_keep_clear_of_walls() -> None:
 
 
 def test_a_robot_that_is_too_near_is_led_away() -> None:
-    behavior = RandomCommands(2, HOLD, WallWatch(TASK, 0.3))
-    behavior.start(range(64), seed=0)
+    act = RandomCommands(2, HOLD, WallWatch(TASK, 0.3)).begin(64, seed=0)
     near = torch.tensor([[0.0, 2.35]]).expand(64, 2)
-    command = behavior.act(believed(near), torch.zeros(64, 2))
+    command = act(believed(near), torch.zeros(64, 2))
     assert float(command[:, 1].max()) < 0.0
 
 
 def test_commands_are_held_and_repeat_with_the_seed() -> None:
-    first, second = RandomCommands(2, (4, 4)), RandomCommands(2, (4, 4))
-    first.start(range(5), seed=1)
-    second.start(range(5), seed=1)
     state = believed(torch.zeros(5, 2))
-    commands = torch.stack([first.act(state, state[:, :2]) for _ in range(8)])
-    assert torch.equal(commands, torch.stack([second.act(state, state[:, :2]) for _ in range(8)]))
+    first, second = (RandomCommands(2, (4, 4)).begin(5, seed=1) for _ in range(2))
+    commands = torch.stack([first(state, state[:, :2]) for _ in range(8)])
+    assert torch.equal(commands, torch.stack([second(state, state[:, :2]) for _ in range(8)]))
     assert torch.equal(commands[:1].expand(4, 5, 2), commands[:4]) and not torch.equal(commands[3], commands[4])
 
 
-def commands_of(behavior: RandomCommands, steps: int) -> Tensor:
-    """Return the commands (steps, B, A) of a behavior that was started."""
-    return torch.stack([behavior.act(torch.zeros(200, 47), torch.zeros(200, 0)) for _ in range(steps)])
-
-
 def test_stress_commands_are_at_the_bounds_and_half_of_them_reverse_the_one_before() -> None:
-    behavior = StressCommands(3, (1, 1))
-    behavior.start(range(200), seed=0)
-    commands = commands_of(behavior, 20)
+    act = StressCommands(3, (1, 1)).begin(200, seed=0)
+    commands = torch.stack([act(torch.zeros(200, 47), torch.zeros(200, 0)) for _ in range(20)])
     assert torch.allclose(commands.abs().amax(-1), torch.ones(20, 200)) and (commands[0] != 0).all()
     is_reversed = (commands[1:] == -commands[:-1]).all(-1)
     assert 0.45 < float(is_reversed.float().mean()) < 0.55
@@ -105,9 +95,8 @@ def test_where_it_is_to_last_an_episode_succeeds_in_its_last_step() -> None:
     task, recorded = replace(CART, objective=Last(horizon=4)), list[Episode]()
     env, still = task.target(2, seed=0), torch.full((2, 1), -0.6)  # 0 m/s
     env.reset()
-    behavior: Any = SimpleNamespace(act=lambda state, goal: still)
     writer: Any = SimpleNamespace(staged=set(), add=lambda episode, number: recorded.append(episode))
-    assert record(task, env, behavior, range(2), writer, max_steps=4, seed=0, progress=silent) == 8
+    assert record(task, env, lambda *_: still, range(2), writer, max_steps=4, seed=0, progress=silent) == 8
     for episode in recorded:
         assert episode.columns[SUCCESS].tolist() == [False, False, False, True]
         assert episode.columns[ACTION].tolist() == pytest.approx([0.0] * 4, abs=1e-6)  # in m/s
@@ -124,15 +113,15 @@ def test_an_episode_that_ends_in_its_last_step_is_terminated_and_not_truncated()
             reward=torch.zeros(2), terminated=ends.clone(), success=torch.zeros(2, dtype=torch.bool)
         ),
     )
-    behavior: Any = SimpleNamespace(act=lambda state, goal: torch.zeros(2, CART.action.size))
+    still = torch.zeros(2, CART.action.size)
     recorded = dict[int, Episode]()
     writer: Any = SimpleNamespace(staged=set(), add=lambda episode, number: recorded.update({number: episode}))
-    assert record(CART, env, behavior, range(2), writer, max_steps=2, seed=0, progress=silent) == 3
+    assert record(CART, env, lambda *_: still, range(2), writer, max_steps=2, seed=0, progress=silent) == 3
     assert [recorded[0].columns[name].tolist() for name in (TERMINATED, TRUNCATED, DONE)] == [[True], [False], [True]]
     assert [recorded[1].columns[name].tolist() for name in (TERMINATED, TRUNCATED)] == [[False] * 2, [False, True]]
     assert recorded[1].columns[DONE].tolist() == [False, True]
     ends.fill_(True)
-    record(CART, env, behavior, range(2), writer, max_steps=1, seed=0, progress=silent)
+    record(CART, env, lambda *_: still, range(2), writer, max_steps=1, seed=0, progress=silent)
     assert [recorded[1].columns[name].tolist() for name in (TERMINATED, TRUNCATED, DONE)] == [[True], [False], [True]]
 
 

@@ -16,7 +16,7 @@ from astra_data.dataset.reader import Dataset
 from astra_data.dataset.writer import StagedWriter
 from astra_data.pipeline.stages import collect as stage
 from astra_data.pipeline.stages import collect as suboptimal
-from astra_data.pipeline.stages.collect import CollectConfig, PolicyBehavior, WallWatch, collect, record
+from astra_data.pipeline.stages.collect import CollectConfig, WallWatch, begin_drawing, collect, record
 from astra_data.policies.running_policy import PolicyFile, running
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.task import Task
@@ -224,11 +224,10 @@ def test_the_policy_that_acted_is_kept(lasting: str, tmp_path: Path, monkeypatch
     assert second.content_hash == first.content_hash
     report = check(first.root)
     assert not report.notes and not report.faults
-    behavior, state = PolicyBehavior(running(TASKS[lasting], kept)), first.columns([STATE])[STATE][:1]
+    policy, state = running(TASKS[lasting], kept), first.columns([STATE])[STATE][:1]
     drawn = []
     for seed in (0, 1):  # the mean would be the same
-        behavior.start(range(1), seed)
-        drawn.append(behavior.act(torch.from_numpy(state), torch.zeros(1, 0)).tolist())
+        drawn.append(begin_drawing(policy, 1, seed)(torch.from_numpy(state), torch.zeros(1, 0)).tolist())
     assert drawn[0] != drawn[1]
 
 

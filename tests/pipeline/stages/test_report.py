@@ -187,7 +187,7 @@ def test_sizes_are_set_side_by_side(rough: None, tmp_path: Path, monkeypatch: py
     path = root / artifact_key("evaluate", "astra", 2, 50) / "evaluation.json"
     edit_json(path, target=outcomes([0, 0, 0, 0], 2))
     asked = {"seeds": [*SEEDS, 7], "sweep": {"percent": [10, 100, 50]}}
-    sized = FakeRecipe("sizes", methods=("direct_transfer", "astra"), percents=(10, 100, 50), settings=asked)
+    sized = FakeRecipe(name="sizes", methods=("direct_transfer", "astra"), percents=(10, 100, 50), settings=asked)
     found = make(root, tmp_path / "results", sized)
     assert found.percents == [50, 100]
     html = read_page((root / "report/results.html").read_text())
