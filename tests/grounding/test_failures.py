@@ -63,13 +63,6 @@ def marked(episodes: PairedEpisodes, soon: Tensor, mask: Tensor) -> PairedEpisod
     return replace(episodes, windows=replace(episodes.windows, fails_soon=soon, mask=mask))
 
 
-def one_failing(episodes: int, length: int, steps: int = 100) -> PairedEpisodes:
-    """Return episodes of which the first fails after `length` steps."""
-    made, mask, soon = hurried(episodes, 0), torch.ones(episodes, steps), torch.zeros(episodes, steps)
-    mask[0, length:], soon[0, max(0, length - RISK_STEPS) : length] = 0, 1
-    return marked(made, soon, mask)
-
-
 def untrained(episodes: PairedEpisodes, latent_size: int = 0) -> FailureModel:
     torch.manual_seed(5)
     made = FailureModel(FailureShape(4, 2, TASK.timestep_s, members=1, latent_size=latent_size)).eval()
@@ -123,7 +116,7 @@ def told(episodes: PairedEpisodes, *, by_latent: bool) -> Tensor:
 def test_it_sees_the_latent_where_only_the_latent_tells(by_latent: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     episodes = hurried(20, 0)
     seen = told(episodes, by_latent=by_latent)
-    monkeypatch.setattr(module, "replayed_inputs", lambda *_: seen)
+    monkeypatch.setattr(module, "replayed_inputs", lambda _, whole, *__: seen if whole is GROUNDING else None)
     made, figures = fit_failures(TASK, GROUNDING, episodes, seed=0)
     assert figures["latent"] is by_latent and made.shape.latent_size == (8 if by_latent else 0)
     without, with_latent = (one["nats_per_failure"] for one in figures["candidates"])
@@ -132,6 +125,17 @@ def test_it_sees_the_latent_where_only_the_latent_tells(by_latent: bool, monkeyp
     said = made.probability(seen[..., : made.shape.input_size])
     fails = failing(TASK, episodes).windows.fails_soon.bool()
     assert said[fails].mean() > 5 * episodes.steps(said).mean()
+
+
+def test_the_seed_decides_folds_and_networks(monkeypatch: pytest.MonkeyPatch) -> None:
+    episodes, divided = hurried(20, 0), list[Tensor]()
+    steps = module._steps(failing(TASK, episodes), torch.zeros(20, 100, 20))
+    assert not module._descended(untrained(episodes).train(), *steps).training  # whose predictions are calibrated
+    monkeypatch.setattr(module, "_cross_fitted", lambda *given: divided.append(torch.stack(given[-1])))
+    monkeypatch.setattr(module, "_descended", lambda network, *_: network)
+    first, again, other = (fit_failures(TASK, GROUNDING, episodes, seed)[0].members.first for seed in (0, 0, 1))
+    assert torch.equal(first.weight, again.weight) and not torch.equal(first.weight, other.weight)
+    assert torch.equal(divided[0], divided[2]) and not torch.equal(divided[0], divided[4])
 
 
 def test_the_likelihood_is_that_of_the_moments_over_a_constant_rate(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -195,7 +199,8 @@ def test_failures_that_abstract_states_show_are_left_to_the_simulator() -> None:
     expected = torch.zeros(3, 30)
     expected[1, 10:] = expected[2, :20] = 1
     assert torch.equal(unseen.windows.fails_soon, expected) and torch.equal(unseen.windows.state, state)
-    assert has_failures(kick, made) and not has_failures(kick, made.select(torch.tensor([0])))
+    # Nor does the third alone do: there is no step but before its failure.
+    assert [has_failures(kick, made.select(torch.tensor(of))) for of in ([0, 1, 2], [0], [2])] == [True, False, False]
 
 
 def test_what_is_seen_of_a_step_is_simulated_from_two_to_three_seconds_before(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -208,7 +213,7 @@ def test_what_is_seen_of_a_step_is_simulated_from_two_to_three_seconds_before(mo
     averages = averages_before(TASK, GROUNDING, failures, episodes)
     assert torch.equal(torch.random.get_rng_state(), drawn) and not seeds
     assert seen.shape == (3, 100, 28) and averages.shape == (3, 100, 15) and not averages[:, 0].any()
-    for episode, step, begun in ((1, 0, 0), (1, 59, 0), (0, 60, 20), (1, 79, 20), (1, 80, 40), (1, 98, 40)):
+    for episode, step, begun in ((1, 0, 0), (1, 59, 0), (0, 60, 20), (1, 79, 20), (1, 80, 40), (1, 99, 40)):
         world = GROUNDING.corrected(TASK.simulator(1))
         state, before = windows.state[episode, begun][None], windows.previous_action[episode, begun][None]
         hidden = GROUNDING.hidden_before(windows)[episode, begun][None]
@@ -221,18 +226,24 @@ def test_what_is_seen_of_a_step_is_simulated_from_two_to_three_seconds_before(mo
             inputs, memory = failures.inputs(here, action[None], world.landed, latent, memory)
         torch.testing.assert_close(seen[episode, step], inputs[0], atol=1e-4, rtol=1e-4)
         torch.testing.assert_close(seen[episode, step, 20:], latent[0], atol=1e-4, rtol=1e-4)
-        if step not in (59, 79):  # the next step is seen from another moment
+        if step not in (59, 79, 99):  # the next step is seen from another moment, or there is none
             torch.testing.assert_close(averages[episode, step + 1], memory[0, -15:], atol=1e-4, rtol=1e-4)
 
 
 def test_the_windows_before_a_failure_are_ranked_against_calm_steps() -> None:
     """One episode fails after 60 steps: what is said is right 11 to 30 steps ahead alone."""
-    episodes = one_failing(2, 60)
+    mask, soon = torch.ones(2, 100), torch.zeros(2, 100)
+    mask[0, 60:], soon[0, 40:60] = 0, 1
+    episodes = marked(hurried(2, 0), soon, mask)
     ahead = left(episodes)
     said = torch.where((ahead >= 11) & (ahead <= 30) & (torch.arange(2) == 0)[:, None], 0.9, 0.1)
-    auc = failure_skill(said, episodes)["auc"]
+    found = failure_skill(said, episodes)
     # Ten of the twenty steps of the neighboring windows are above all calm ones, ten level with them.
-    assert auc == {"1-20": pytest.approx(0.75), "11-30": 1.0, "21-40": pytest.approx(0.75)}
+    assert found["auc"] == {"1-20": pytest.approx(0.75), "11-30": 1.0, "21-40": pytest.approx(0.75)}
+    # Within 20 steps fail 10 of the 20 at 0.9, and 10 of the 140 at 0.1.
+    assert found["reliability"] == [pytest.approx([0.1, 10 / 140, 140]), pytest.approx([0.9, 10 / 20, 20])]
+    wrong, usual = (20 * 0.9**2 + 140 * 0.1**2) / 160, 20 / 160 * 140 / 160
+    assert found["brier_skill"] == pytest.approx(1 - wrong / usual, rel=1e-3)
 
 
 TIMESTEP_S = 0.05
@@ -274,23 +285,20 @@ def rms(move: Tensor) -> float:
 
 def test_the_magnitudes_are_moves_in_their_deviations_and_commands() -> None:
     made, of = failure_model(), windows()
-    made.wanted_std.fill_(2.0)
-    made.moved_std.fill_(3.0)
-    made.missed_std.fill_(4.0)
+    of.previous_action[:, 0], of.mask[2, 6:] = 0.5, 0.0
+    for moving in (of.state, of.next_state, of.simulated_next):
+        moving[..., 3] = 1.0  # but for the last entry
+    ways = of.simulated_next - of.state, of.next_state - of.state, of.next_state - of.simulated_next
+    wanted_std, moved_std, missed_std = (way[of.mask.bool()].std(0).clamp_min(1e-3) for way in ways)
+    made.set_move_scales(of)
     inputs = seen(made, of)
     for episode, step in ((0, 0), (1, 5)):
         state, action = of.state[episode], of.action[episode]
         wanted = of.simulated_next[episode, step] - state[step]
         moved = state[step] - state[step - 1] if step else torch.zeros(4)
         missed = state[step] - of.simulated_next[episode, step - 1] if step else torch.zeros(4)
-        before = action[step - 1] if step else torch.zeros(2)
-        expected = [
-            rms(wanted) / 2,
-            rms(moved) / 3,
-            rms(missed) / 4,
-            float((action[step] - before).norm()),
-            float(action[step].norm()),
-        ]
+        expected = [rms(wanted / wanted_std), rms(moved / moved_std), rms(missed / missed_std)]
+        expected += [float((action[step] - of.previous_action[episode, step]).norm()), float(action[step].norm())]
         assert inputs[episode, step, :5].tolist() == pytest.approx(expected, abs=1e-5)
 
 
@@ -347,6 +355,8 @@ def test_walls_are_seen_where_the_robot_and_where_the_simulator_goes() -> None:
         to_wall.append(float(U_MAZE.clearance(place.numpy())))
     assert walls[:6].tolist() == pytest.approx(to_wall, abs=0.11) and to_wall[5] < 0.2 < to_wall[1] < to_wall[0]
     assert walls[6:].tolist() == pytest.approx([to_wall[0]] * 5, abs=1e-5)
+    made.clearance = torch.nn.Buffer(torch.arange(3.0).repeat(2, 1))  # wider than high: beyond, its outermost cells
+    assert made.inputs(*step)[0][0, 20:].tolist() == [2.0] * 11
     made.clearance.fill_(5.0)
     assert made.inputs(*step)[0][0, 20:].tolist() == [3.0] * 11  # beyond, walls are alike
 

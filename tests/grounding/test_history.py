@@ -1,4 +1,5 @@
 import json
+from typing import Any
 
 import pytest
 import torch
@@ -18,9 +19,11 @@ from astra_data.worlds.plane.point_mass import PointMass
 @pytest.mark.parametrize("latent_size", [None, 0, 8])
 def test_a_failure_model_is_saved_with_its_grounding(latent_size: int | None) -> None:
     failures = None if latent_size is None else failure_model(latent_size)
-    tensors, metadata = HistoryGrounding(model(), failures).to_file()
+    walls: dict[str, Any] = {"clearance_m": latent_size, "fails_at_walls": latent_size == 0}
+    tensors, metadata = HistoryGrounding(model(), failures, **walls).to_file()
     read = HistoryGrounding.from_file(dict(tensors), json.loads(json.dumps(metadata)), "cpu")
     assert ("failures" in metadata) == (read.failures is not None) == (failures is not None)
+    assert {name: getattr(read, name) for name in walls} == walls
     if failures is not None and read.failures is not None:
         assert read.failures.shape == failures.shape
         saved = read.failures.state_dict()
@@ -157,8 +160,9 @@ def test_a_failure_models_memory_is_kept_and_forgotten_at_a_start() -> None:
     torch.testing.assert_close(resumed.failure_risk(), wanted)
 
     known = torch.rand(3, 8 + 15)
-    one.start(HERE.expand(3, 4), ROWS, GOAL, hidden=known)
-    assert torch.equal(one.state_dict()["remembered"][:, -15:], known[:, 8:])
+    one.start(HERE.expand(3, 4), ROWS, GOAL, hidden=known, previous_action=played[0])
+    remembered = failures.initial_memory(HERE.expand(3, 4), played[0], known[:, 8:])
+    assert torch.equal(one.state_dict()["remembered"], remembered)
     one.start(HERE.expand(3, 4), ROWS, GOAL)
     one.step(played[0])
     fresh = simulator(used, failures)

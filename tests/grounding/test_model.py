@@ -49,14 +49,9 @@ def untrained() -> GroundingModel:
         2, 2, 2, latent_size=SIZE, embedding_size=32, head_sizes=(32,), position_octaves=0, corrects_reward=False
     )
     model = GroundingModel(shape)
-    take_scales(
-        model,
-        {
-            "state": TRAINING.state.flatten(0, 1),
-            "goal": TRAINING.goal.flatten(0, 1),
-            "correction": (TRAINING.next_state - TRAINING.simulated_next).flatten(0, 1),
-        },
-    )
+    columns = {"state": TRAINING.state, "goal": TRAINING.goal}
+    columns["correction"] = TRAINING.next_state - TRAINING.simulated_next
+    take_scales(model, {name: values.flatten(0, 1) for name, values in columns.items()})
     model.set_reward_scales(TRAINING.reward.reshape(-1, 1), TRAINING.goes_on.flatten(), TRAINING.failed.flatten())
     return model
 
@@ -136,11 +131,8 @@ def model(*, corrects_reward: bool = True) -> GroundingModel:
     torch.manual_seed(0)
     made = GroundingModel(GroundingShape(4, 2, 2, latent_size=8, head_sizes=(16,), corrects_reward=corrects_reward))
     given = windows()
-    columns = {
-        "state": 3.0 + 2.0 * given.state,
-        "goal": given.goal - 1.0,
-        "correction": 0.5 * (given.next_state - given.simulated_next),
-    }
+    columns = {"state": 3.0 + 2.0 * given.state, "goal": given.goal - 1.0}
+    columns["correction"] = 0.5 * (given.next_state - given.simulated_next)
     take_scales(made, {name: values.flatten(0, 1) for name, values in columns.items()})
     real = given.mask.bool()
     rewards = both_rewards(given) if corrects_reward else given.reward.unsqueeze(-1)
@@ -255,8 +247,10 @@ def test_the_loss_of_the_reward_is_of_steps_whose_reward_is_learned() -> None:
     torch.testing.assert_close(used.losses(other, weights)[1]["reward"], expected)
     none = replace(given, goes_on=torch.zeros(EPISODES, STEPS))
     assert float(used.losses(none, weights)[1]["reward"]) == 0.0
-    last = list(used.reward_head.parameters())
-    for parameter in last[-2:]:
+    drawn = replace(given, mask=given.mask * (torch.arange(STEPS) > 0))
+    expected = 0.5 * error[(given.goes_on * drawn.mask).bool()].mean()
+    torch.testing.assert_close(used.losses(drawn, weights)[1]["reward"], expected)
+    for parameter in list(used.reward_head.parameters())[-2:]:
         parameter.data.zero_()
     # What predicts the means loses a half for each.
     assert float(used.losses(given, weights)[1]["reward"]) == pytest.approx(1.0, rel=1e-4)
@@ -321,13 +315,9 @@ def episodes() -> PairedEpisodes:
 
 def model_of(given: PairedEpisodes) -> GroundingModel:
     torch.manual_seed(1)
-    made = GroundingModel(
-        GroundingShape(4, 2, 2, latent_size=6, head_sizes=(8,), position_octaves=0, corrects_reward=False)
-    )
-    windows = given.windows
-    made.set_reward_scales(
-        given.steps(windows.reward)[:, None], given.steps(windows.goes_on), given.steps(windows.failed)
-    )
+    shape = GroundingShape(4, 2, 2, latent_size=6, head_sizes=(8,), position_octaves=0, corrects_reward=False)
+    made, windows = GroundingModel(shape), given.windows
+    made.set_reward_scales(*map(given.steps, (windows.reward[..., None], windows.goes_on, windows.failed)))
     list(made.correction.parameters())[-2].data.normal_(std=0.05)
     return made.requires_grad_(False)
 

@@ -52,9 +52,8 @@ def write(
             ended = last & (episode in (2, 3))
             values |= {keys.REWARD: -steps, keys.TERMINATED: ended, keys.TRUNCATED: last & ~ended, keys.DONE: last}
             if keys.NEXT_STATE in sizes:
-                values[keys.NEXT_STATE] = values[keys.STATE] + (~ended if made_up else np.ones(length))[:, None].astype(
-                    np.float32
-                )
+                moved = (~ended if made_up else np.ones(length)).astype(np.float32)
+                values[keys.NEXT_STATE] = values[keys.STATE] + moved[:, None]
             metadata: dict[str, int] = {} if held_out is None else {"held_out": episode in held_out}
             metadata |= {"source_episode": sources[episode]} if sources and episode in sources else {}
             values |= {keys.SUCCESS: last & (episode == 2)}
@@ -83,7 +82,8 @@ def test_where_no_step_is_one_of_the_robot_there_is_nothing_to_load(
     """The third and the fourth episode end in the only step that they have."""
     monkeypatch.setitem(globals(), "LENGTHS", (1, 1, 1, 1))
     whole = write(tmp_path / "pairs", SIZES | {keys.NEXT_STATE: 3}, made_up=True)
-    assert PairedEpisodes.load(whole).lengths.tolist() == [1, 1]
+    left = PairedEpisodes.load(whole)
+    assert left.lengths.tolist() == [1, 1] and left.reward.tolist() == [[-label(0, 0)], [-label(1, 0)]]
     ended = filter_episodes(Dataset.open(whole), without=[0, 1], out=tmp_path / "ended")
     with pytest.raises(BadInputError, match="no step is left: each episode has a single one, whose"):
         PairedEpisodes.load(ended)

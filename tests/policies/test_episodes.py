@@ -83,8 +83,9 @@ def driving(speed: float) -> Act:
 
 
 def test_episodes_end_in_success_in_failure_or_with_their_time() -> None:
-    there = in_target(CART, lambda goal: driving(0.9), 5, seed=3).outcome
-    assert there.success == [1.0] * 5 and there.failed == [0.0] * 5
+    there = in_target(CART, lambda goal: driving(0.9), 5, seed=3)
+    assert there.outcome.success == [1.0] * 5 and there.outcome.failed == [0.0] * 5
+    assert len(there.filmed) - 1 == there.outcome.steps[0] < max(there.outcome.steps)
     tipped = in_target(CART, lambda goal: driving(3.5), 5, seed=3)
     assert tipped.outcome.failed == [1.0] * 5 and tipped.outcome.steps == [1] * 5
     late = in_target(CART, lambda goal: driving(-0.5), 5, seed=3)
@@ -121,9 +122,7 @@ def test_the_goals_are_those_of_the_seed_in_any_simulator() -> None:
     outcome = runs[0][0]
     # It stops where the last episode ends; every command of 4 m/s is beyond 2 m/s.
     assert outcome.position.shape[1] - 1 == max(outcome.steps) <= 5 and asked.share == 1.0
-    assert [steps for steps in outcome.steps] == [
-        int(torch.ceil(goal / (0.1 * SPEED) - 1e-4)) for goal in goals[0][:, 0]
-    ]
+    assert outcome.steps == [int(torch.ceil(goal / (0.1 * SPEED) - 1e-4)) for goal in goals[0][:, 0]]
     assert fmean(outcome.success) == 1.0
 
 
@@ -141,6 +140,8 @@ def constant(command: float, simulation: Simulation = SIMULATION) -> PolicyFile:
 
 def test_what_it_reaches_is_what_the_simulator_s_rule_says() -> None:
     """Forward at 0.4 m a step, goals from 1 to 2 m, uniform: 3, 4 or 5 steps; 4.2 on average."""
+    limited = constant(1.0, Simulation(WorldConfig(command_limit=0.5)))
+    assert running(CART, limited).command_limit == 0.5
     reached = reached_in_own_world(CART, constant(1.0), NO_GROUNDING, seed=0)
     assert reached.success == 1.0 and reached.steps == pytest.approx(4.2, abs=0.2)
     # At 0.4 m/s goals up to 1.6 m are in reach in 4 s.
@@ -272,6 +273,10 @@ def test_all_episodes_start_from_moments_with_their_goals_where_the_share_is_one
     for state, goal in zip(saved["physics"][:, 1:30].float(), saved["goal"], strict=True):
         found = (states - state).abs().amax(1) < 1e-4
         assert found.any() and (goals[found] == goal).all()
+    env.step(torch.ones(4, 2))
+    before = env.state_dict()["physics"].clone()
+    env.reset(torch.tensor([False, True, False, True]))
+    assert (env.state_dict()["physics"] != before).any(1).tolist() == [False, True, False, True]
 
 
 def test_all_of_the_state_is_observed_in_full_and_the_planar_part_otherwise() -> None:
@@ -296,7 +301,8 @@ def test_all_of_the_state_is_observed_in_full_and_the_planar_part_otherwise() ->
 def test_a_deployed_policy_sees_what_it_saw_in_training() -> None:
     torch.manual_seed(0)
     env = world("full")
-    observation = env.reset()
+    before, observation = env.reset(), env.reset()
+    assert (before != observation).any(1).all()  # each begins anew
     policy = ActorCritic(PolicyShape(33, 2))
     deployed = RunningPolicy(TASK, policy, observed="full")
     assert deployed.observation_size == 33

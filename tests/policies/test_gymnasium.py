@@ -57,6 +57,10 @@ def test_failures_are_told_apart_from_successes() -> None:
             break
     assert terminated.tolist() == [False, True] and infos["final_info"]["failed"].tolist() == [False, True]
     assert not infos["failed"].any() and not infos["final_info"]["success"].any()
+    one, beside = SimulatorEnv(walls, simulator), torch.tensor([[-5.99, 4.0, -1.0, 0.0]] * 2)
+    one.start_from(beside, torch.tensor([[-6.0, 4.0], [4.0, 4.0]]))
+    step = one.step(torch.tensor([[-1.0, 0.0]] * 2))
+    assert simulator.blocked.all() and step.success.tolist() == [True, False] and one.failed.tolist() == [False, True]
 
 
 @pytest.mark.filterwarnings("ignore:.*infinity")

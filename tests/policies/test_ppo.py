@@ -45,16 +45,22 @@ def test_resuming_gives_the_same_parameters_to_the_bit(memory: int) -> None:
 
 @pytest.mark.parametrize("terminates", [False, True])
 def test_running_out_of_time_bootstraps_and_ending_does_not(terminates: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    env = ConstantReward(16, 5.0 if terminates else math.inf)
-    monkeypatch.setattr(env, "observe", lambda: 1.0 + 9.0 * (env.state == 0.0))  # what comes next is seen to be new
-    learner = ppo(env, 2, horizon=10**6 if terminates else 5, discount=0.9)
-    list(learner.policy.critic.parameters())[-1].data.fill_(3.0)
-    rollout = learner._collect()
-    done, value = rollout["done"], float(learner.policy.value(torch.ones(1, 1)).detach())
-    assert done.any() and torch.equal(rollout["terminated"], done & terminates) and value > 2.0
+    # What comes next is seen to be new.
+    monkeypatch.setattr(ConstantReward, "observe", lambda env: 1.0 + 9.0 * (env.state == 0.0))
+    env, rollouts = ConstantReward(16, 5.0 if terminates else math.inf), []
+    endless = ppo(ConstantReward(16, math.inf), 2, horizon=10**6, memory=8, rollout_steps=32)
+    for one in (endless, ppo(env, 2, horizon=10**6 if terminates else 20, memory=8, discount=0.9)):
+        list(one.policy.critic.parameters())[-2].data.mul_(100.0)
+        torch.manual_seed(0)
+        rollouts.append(one._collect())
+    rollout, following = rollouts[1], rollouts[0]["value"][:, 1:17]
+    done = rollout["done"]
+    assert done.any() and torch.equal(rollout["terminated"], done & terminates) and following.abs().min() > 0.1
     assert (rollout["reward"] != 1.0).all()  # but in units of the returns' deviation
-    expected = rollout["reward"] + (0.0 if terminates else 0.9 * value)
-    torch.testing.assert_close(rollout["value_target"][done], expected[done])
+    # Both remember the same until the first episode of a row ends, or the rollout.
+    ends = torch.arange(16) == torch.where(done.any(1), done.int().argmax(1), 15)[:, None]
+    expected = rollout["reward"] + 0.9 * following * ~rollout["terminated"]
+    torch.testing.assert_close(rollout["value_target"][ends], expected[ends])
 
 
 def test_generalized_advantages_are_discounted_sums_of_errors_up_to_the_episodes_end() -> None:
@@ -115,7 +121,7 @@ def test_an_update_is_that_of_the_printed_loss(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_a_segment_begins_with_the_memory_that_the_policy_acted_with(monkeypatch: pytest.MonkeyPatch) -> None:
-    learner = ppo(Recall(4), 1, horizon=5, memory=8, rollout_steps=48)
+    learner = ppo(Recall(4), 1, horizon=5, memory=8, rollout_steps=24)
     batches: list[dict[str, torch.Tensor]] = []
 
     def diverged(batch: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
@@ -125,7 +131,7 @@ def test_a_segment_begins_with_the_memory_that_the_policy_acted_with(monkeypatch
     monkeypatch.setattr(learner, "_loss", diverged)
     learner._learn(learner._collect())
     (batch,) = batches  # where learning stops
-    assert batch["action"].shape == (6, 16, 1)  # half of the three segments of four environments
+    assert batch["action"].shape == (6, 8, 1)  # half of the three segments of four environments
     assert batch["hidden"].abs().amax(1).gt(0.01).any()
     seen = (batch[name] for name in ("observation", "previous_action", "hidden", "start"))
     with torch.no_grad():

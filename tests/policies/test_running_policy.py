@@ -80,7 +80,7 @@ def test_with_inputs_the_policy_observes_an_estimate_in_place_of_phi(aligned: bo
     policy = ActorCritic(PolicyShape(observation_size=16, action_size=2))
     for layer in policy.actor.parameters():
         layer.mul_(10)
-    running = RunningPolicy(TASK, policy, model, eyes if aligned else None, sensing=eyes)
+    running = RunningPolicy(TASK, policy, model, eyes if aligned else None, command_limit=0.2, sensing=eyes)
     running.start(3)
     names = [*eyes.inputs]
     given: list[Shown] = [{names[0]: STATE[:, step, :3], names[1]: STATE[:, step, 3:].numpy()} for step in range(6)]
@@ -92,7 +92,8 @@ def test_with_inputs_the_policy_observes_an_estimate_in_place_of_phi(aligned: bo
     else:
         latent, _ = model.encoder(model.encoder_input(abstract, GOALS, previous(actions)))
     observation = policy_observation(TASK.objective, abstract, GOALS, latent)
-    torch.testing.assert_close(actions, policy.policy(observation)[0], atol=1e-5, rtol=0)
+    expected = TASK.objective.limit_command(policy.policy(observation)[0], 0.2)
+    torch.testing.assert_close(actions, expected, atol=1e-5, rtol=0)
     running.start(3)  # forgets
     torch.testing.assert_close(running.act(STATE[:, 0], GOAL), actions[:, 0], atol=1e-5, rtol=0)
 
@@ -117,10 +118,7 @@ def test_in_place_of_features_come_pictures_of_their_camera(tmp_path: Path) -> N
         commands.append(running.command({**seen, "observation.joints": joints}, GOAL))
     assert torch.equal(*commands)
     refused: list[tuple[Any, str]] = [
-        (
-            STATE[:, 0],
-            "takes a dict in place of states: expected observation.features.front, or pictures of observation",
-        ),
+        (STATE[:, 0], "takes a dict in place of states: expected observation.features.front, or pictures of obs"),
         ({camera: pictures}, "expected observation.joints, got observation.images.front"),
         ({camera: pictures[:2], "observation.joints": joints}, r"expected the shape \(3, 3\), got \(2, 3\)"),
         ({camera: pictures / 255.0, "observation.joints": joints}, "of uint8, got float64"),
@@ -141,9 +139,7 @@ def test_states_and_inputs_are_not_taken_for_each_other() -> None:
     running.start(1)
     with pytest.raises(BadInputError, match="expected states, got a dict"):
         running.command({"observation.joints": STATE[:1, 0]}, GOAL[:1])
-    with pytest.raises(
-        BadInputError, match=r"reads observation[.]features[.]front, observation[.]joints, of which the target"
-    ):
+    with pytest.raises(BadInputError, match=r"reads observation[.]features[.]front, observation[.]joints, of which"):
         RunningPolicy(TASK, policy, target_encoder=sensing())
     with pytest.raises(BadInputError, match="the policy observes full states"):
         RunningPolicy(TASK, policy, observed="full", sensing=sensing())
@@ -187,9 +183,8 @@ def test_the_encoder_sees_the_shortened_command_and_the_policy_its_own() -> None
         features, hidden = policy.remember(observation[:, step], own, hidden)
         own = policy.act(features)
         outputs.append(own)
-    torch.testing.assert_close(
-        actions, TASK.objective.limit_command(torch.stack(outputs, dim=1), 0.2), atol=1e-4, rtol=0
-    )
+    expected = TASK.objective.limit_command(torch.stack(outputs, dim=1), 0.2)
+    torch.testing.assert_close(actions, expected, atol=1e-4, rtol=0)
     assert torch.stack(outputs).norm(dim=-1).max() > 0.3
 
 

@@ -61,20 +61,16 @@ def test_the_lower_quartile_is_what_counts_then_the_mean() -> None:
     level = Candidate(row="a", seed=2, success={0: 0.2, 1: 0.2})
     assert liked_by_one.predicted > steady.predicted and liked_by_one.lower < steady.lower
     assert Candidate(row="a", seed=0, success={1: 0.0, 2: 0.4}).lower == pytest.approx(0.1)
-    found = Judged(judge="nas", episodes=5, candidates=[level, liked_by_one, steady])
-    assert found.ranked() == [steady, liked_by_one, level]
+    alike = level.model_copy(update={"seed": 3})
+    found = Judged(judge="nas", episodes=5, candidates=[level, liked_by_one, steady, alike])
+    assert found.ranked() == [steady, liked_by_one, level, alike]
 
 
 def test_an_interval_takes_judges_as_the_sampling_unit_and_needs_three() -> None:
-    success = {1: 0.1, 2: 0.9, 3: 0.5}
-    candidates = [
-        Candidate(row="a", seed=0, success=success),
-        Candidate(row="a", seed=1, success={judge: success[judge] for judge in (1, 2)}),
-    ]
-    found = choice_of(Judged(judge="nas", episodes=100, candidates=candidates), None, measured={})
-    assert found is not None
-    three, two = (found.judged.estimate(one) for one in sorted(found.candidates, key=lambda one: one.seed))
-    assert three == summarize([0.1, 0.9, 0.5], limit=1.0, trials=100) and (two.low, two.high) == (None, None)
+    three, two = (Candidate(row="a", seed=0, success=of) for of in ({1: 0.1, 2: 0.9, 3: 0.5}, {1: 0.1, 2: 0.9}))
+    found = Judged(judge="nas", episodes=100, candidates=[three])
+    assert found.estimate(three) == summarize([0.1, 0.9, 0.5], limit=1.0, trials=100)
+    assert (found.estimate(two).low, found.estimate(two).high) == (None, None)
 
 
 def test_a_choice_is_worth_its_regret() -> None:
@@ -115,6 +111,7 @@ def test_what_the_stage_wrote_is_read(tmp_path: Path) -> None:
 CANDIDATES = [
     Candidate(row="astra", seed=1, success={0: 0.5, 2: 0.5}),
     Candidate(row="nas", seed=1, success={0: 0.0, 2: 1.0}),  # with a lower quartile of 0.25
+    Candidate(row="rma", seed=1, success={0: 0.9}),
 ]
 JUDGED = Judged(judge="nas", episodes=5, candidates=CANDIDATES)
 FIRST = TrialRound(
@@ -140,6 +137,7 @@ def test_the_page_says_who_was_tried_how_often_with_what_success(tmp_path: Path)
     page = select_page("cart", JUDGED, done)
     assert "**NAS, seed 1**: success 1.00 [0.51, 1.00]. 6 of 9 episodes" in page
     assert "| 2 | NAS | 1 | 2 | 2 | 0.62 | 1.00 [0.51, 1.00] |" in page  # (4 · 0.25 + 4) / (4 + 4)
+    assert "| 1 | NAS | 1 | 2 | 2 | 0.50 | 1.00 [0.34, 1.00] |" in page  # as it was then
     assert "control variate" not in page
     assert "(control variate)" in select_page("cart", JUDGED, done.model_copy(update={"by_hand": True}))
 
@@ -161,16 +159,22 @@ def test_advice_is_to_go_on_until_the_best_is_above_all_others() -> None:
     assert after([1, 0], [1] * 9).startswith("NAS, seed 1 is ahead, with a success of 1.00 [0.70, 1.00]. ASTRA, seed 1")
     assert after([1, 0], [1] * 9).endswith("may be as good: go on.")
     assert after([1, 0], [1] * 9, trials=11).endswith("may be as good.")
+    # The rival is who may be best: not RMA, which was predicted to be.
+    won = {"astra": [1] * 9, "nas": [1, 0], "rma": [0] * 3}
+    tried = [Tried(row=row, seed=1, success=of) for row, of in won.items()]
+    three = TrialRound(trials=9, candidates=[(row, 1) for row in won], tried=tried)
+    assert "NAS, seed 1, with 0.50" in advice(JUDGED, BEGUN.model_copy(update={"rounds": [three]}))
     # The prediction, 0.5 in ten episodes, explains the two failures of trials that it knows to be hard.
     told = success_rate([1, 0, 1, 0], [0.9, 0.1, 0.9, 0.1], 0.5, 10)
     assert interval(told) in after([1, 0, 1, 0], [0], predicted=[0.9, 0.1, 0.9, 0.1]) != after([1, 0, 1, 0], [0])
 
 
 def test_a_candidate_stands_by_all_its_trials_so_far() -> None:
-    second = TrialRound(trials=2, candidates=[("nas", 1)], tried=[Tried(row="nas", seed=1, success=[0, 1])])
-    found = standings(JUDGED, None, [FIRST, second])
+    tried = (Tried(row="nas", seed=1, success=[of, 1], predicted=[0.1, told]) for of, told in ((1, 0.8), (0, 0.9)))
+    rounds = [TrialRound(trials=2, candidates=[("nas", 1)], tried=[one]) for one in tried]
+    found = standings(JUDGED, None, rounds)
     assert [*found] == [("nas", 1)] and found["nas", 1].mean == (4 * 0.25 + 3) / 8
-    assert found["nas", 1].rate == success_rate([1, 1, 0, 1], [], 0.5, 10)
+    assert found["nas", 1].rate == success_rate([1, 1, 0, 1], [0.1, 0.8, 0.1, 0.9], 0.5, 10)
     assert [*standings(JUDGED, None, [FIRST])] == [("astra", 1), ("nas", 1)]
 
 

@@ -1,18 +1,14 @@
 import json
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from astra_data.core.errors import BadInputError
 from astra_data.reports.figures.charts import reliability
 from astra_data.reports.held_out import write_held_out
-
-Rates = Mapping[str, Mapping[str, NDArray[np.float64]]]
 
 
 def write(root: Path, percent: int, seed: int, error: float, **more: Any) -> None:
@@ -74,10 +70,14 @@ def test_a_correction_that_makes_the_simulator_worse_is_named(tmp_path: Path) ->
     write(tmp_path, 50, 0, 0.1, grounded={"mean": [0.1, 9.0], "low": [0.09, 8.0]})
     write(tmp_path, 100, 0, 0.2, grounded={"mean": [0.2, 4.5], "low": [0.18, 4.3]})
     assert warning not in page(tmp_path, 50, 100)  # without a correction it is up to 4.4
-    write(tmp_path, 100, 0, 0.2, grounded={"mean": [0.2, 4.5], "low": [0.18, 4.41]})
-    # By the most data: there it is 0.2 after a step, as half of what it is without, and 4 without after ten.
-    text = page(tmp_path, 50, 100)
-    assert warning in text and "- `x`, NAS: 10 steps ahead (4.5, without 4)\n" in text
+    for low in (4.41, None):  # or without an interval
+        write(tmp_path, 100, 0, 0.2, grounded={"mean": [0.2, 4.5], "low": [0.18, low]})
+        # By the most data: there it is 0.2 after a step, as half of what it is without, and 4 without after ten.
+        text = page(tmp_path, 50, 100)
+        assert warning in text and "- `x`, NAS: 10 steps ahead (4.5, without 4)\n" in text
+    far = {key: [1, 4501] for key in ("mean", "low", "high")}  # of what moves by thousands, both predict all
+    write(tmp_path, 100, 0, 0.2, grounded={"mean": [0.2, 4.5], "low": [0.18, None]}, still=far)
+    assert warning not in page(tmp_path, 50, 100)
 
 
 @pytest.mark.parametrize(
@@ -105,10 +105,8 @@ def test_rows_may_have_other_sizes(tmp_path: Path) -> None:
     text = page(tmp_path, 25, 100, rows=("nas", "astra"))
     assert "| size | simulator | 1 step (0.05 s) |\n" in text  # what all have
     rows = [line.split(" | ")[:2] for line in text.splitlines() if "%" in line and "|" in line]
-    assert rows == [
-        *(["| 25 %", "No grounding"], ["| 25 %", "NAS, grounded"]),
-        *(["| 100 %", "No grounding"], ["| 100 %", "ASTRA, grounded"]),
-    ]
+    sizes = {"| 25 %": "NAS, grounded", "| 100 %": "ASTRA, grounded"}
+    assert rows == [[size, shown] for size, row in sizes.items() for shown in ("No grounding", row)]
 
 
 def test_nothing_finished_is_no_page_and_a_malformed_file_one_line(tmp_path: Path) -> None:
@@ -153,13 +151,8 @@ def test_how_well_failures_are_predicted_is_shown_where_it_was_measured(tmp_path
 
 def test_the_figure_pools_the_steps_of_all_seeds_by_bin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of the whole dataset; a predicted rate of 0.3 is in the bin of 0.2, with twice as many steps."""
-    shown: list[Rates] = []
-
-    def noted(parts: Rates) -> Figure:
-        shown.append(parts)
-        return reliability(parts)
-
-    monkeypatch.setattr("astra_data.reports.figures.charts.reliability", noted)
+    shown = Mock(wraps=reliability)
+    monkeypatch.setattr("astra_data.reports.figures.charts.reliability", shown)
     for percent, seed in ((100, 0), (100, 1), (25, 0)):
         write(tmp_path, percent, seed, 0.1)
     write_failures(tmp_path, 0, 1.0)
@@ -168,7 +161,7 @@ def test_the_figure_pools_the_steps_of_all_seeds_by_bin(tmp_path: Path, monkeypa
     file = tmp_path / "ground/nas/percent_100/seed_1/metrics.json"
     file.write_text(json.dumps({"failures": {"failure_model": of}}))
     page(tmp_path, 25, 100, seeds=(0, 1))
-    (parts,) = shown
+    (parts,) = shown.call_args.args
     assert [*parts] == ["failure model"] and [*parts["failure model"]] == ["nas"]
     predicted, observed, steps = parts["failure model"]["nas"]
     np.testing.assert_allclose(predicted, [0.01, (60 * 0.2 + 120 * 0.3) / 180, 0.6])

@@ -5,6 +5,7 @@ import pytest
 from fake_runs import line, results
 
 from astra_data.core.errors import BadInputError
+from astra_data.reports.choice import Candidate, Judgment
 from astra_data.reports.results import (
     SIMULATED,
     TESTED,
@@ -31,6 +32,10 @@ def error(row: str, seed: int, simulator: str, *mean: float, horizons: tuple[int
     )
 
 
+def judged(seed: int, episodes: int = 5) -> Judgment:
+    return Judgment(judge="nas", episodes=episodes, candidates=[Candidate(row="nas", seed=seed, success={7: 0.5})])
+
+
 def test_code_and_machine_stand_once_with_all_stages_that_ran_there() -> None:
     def origin(commit: str, *stages: str) -> Origin:
         return Origin(commit=commit, machine=None, packages={}, stages=[*stages])
@@ -47,6 +52,7 @@ def test_numbers_are_found_by_method_place_and_size() -> None:
         line("astra", 0, percent=20, success=0.0),
         line("nas", 0, success=0.0),
         rows=("direct_transfer", "astra"),
+        errors=[error("nas", 0, "raw", 1.0, 2.0).model_copy(update={"percent": 50})],  # where nothing is tested
     )
     assert found.values("astra", "success") == {0: 1.0, 1: 0.5}
     assert found.values("astra", "success", SIMULATED) == {0: 0.25}
@@ -59,8 +65,7 @@ def test_numbers_are_found_by_method_place_and_size() -> None:
 
 def test_the_interval_of_a_score_stays_within_what_it_can_be() -> None:
     steps = [line("astra", seed, steps=10.0 * seed) for seed in range(3)]
-    (score,) = (SURVIVED_STEPS,)
-    found = results(*steps, scores=(score,)).score_of("astra")
+    found = results(*steps, scores=(SURVIVED_STEPS,)).score_of("astra")
     assert found and found.low is not None and found.low < 0
     shares = results(*(line("astra", seed, success=0.5 * seed) for seed in range(3))).score_of("astra")
     assert shares and (shares.low, shares.high) == (0.0, 1.0)
@@ -68,8 +73,7 @@ def test_the_interval_of_a_score_stays_within_what_it_can_be() -> None:
 
 def test_what_is_written_is_read_again(tmp_path: Path) -> None:
     training = TrainingFacts(row="astra", seed=0, steps=[1.0, 2.0], score=[float("nan"), 0.5])
-    found = results(line("astra", 0, success=0.5), errors=[error("nas", 0, "raw", 1.0, 2.0)])
-    found = found.model_copy(update={"trainings": [training]})
+    found = results(line("astra", 0, success=0.5), errors=[error("nas", 0, "raw", 1.0, 2.0)], trainings=[training])
     path = tmp_path / "r.json"
     path.write_text(results_json(found))
     again = read_results(path)
@@ -90,9 +94,11 @@ def test_merging_loses_nothing_and_says_what_it_replaces() -> None:
         line("nas", 0, success=1.0),
         rows=("nas", "astra"),
         errors=[error("nas", 0, "raw", 1.0, 2.0)],
+        judged=judged(0),
     )
-    second = results(line("astra", 1, success=0.75), line("astra", 2, success=1.0), rows=("astra",))
+    second = results(line("astra", 1, success=0.75), line("astra", 2, success=1.0), rows=("astra",), judged=judged(1))
     merged = merge([first, second])
+    assert merged.judged and [one.seed for one in merged.judged.candidates] == [0, 1]
     assert merged.rows == ("astra", "nas") and merged.values("astra", "success") == {0: 0.25, 1: 0.75, 2: 1.0}
     assert merged.values("nas", "success") == {0: 1.0} and merged.errors == first.errors
     assert replaced(first, second) == ["astra seed 1 (success 0.5, now 0.75)"] and replaced(first, first) == []
@@ -104,6 +110,8 @@ def test_merging_loses_nothing_and_says_what_it_replaces() -> None:
         ({"episodes": 9}, "got episodes 4 and 9"),
         ({"task": "u"}, "got task t and u"),
         ({"leg_scale": 1.5}, "got leg_scale 1.0 and 1.5"),
+        ({"tested_in": "simulators"}, "got tested_in target and simulators"),
+        ({"judged": judged(1, episodes=9)}, "got judges .*'episodes': 5.* and .*'episodes': 9"),
         (
             {"datasets": [DatasetUse(stage="pair", seed=0, version="1", content_hash="b")]},
             "pair seed 0 with content a and b",
@@ -113,7 +121,7 @@ def test_merging_loses_nothing_and_says_what_it_replaces() -> None:
 def test_results_that_were_made_differently_are_not_merged(changes: dict[str, object], message: str) -> None:
     uses = [DatasetUse(stage="pair", seed=0, version="1", content_hash="a")]
     with pytest.raises(BadInputError, match=message):
-        merge([results(datasets=uses), results(**changes)])
+        merge([results(datasets=uses, judged=judged(0)), results(**changes)])
 
 
 def test_errors_are_averaged_over_seeds_where_all_know_them() -> None:

@@ -89,7 +89,8 @@ def test_below_three_seeds_there_is_no_interval(values: list[float]) -> None:
     assert summarize(values, limit=1.0, trials=EPISODES) == alone and ends(alone) == "-"
     here, there = dict(enumerate(values)), dict(enumerate([0.0] * len(values)))
     assert paired_difference(here, there, limit=1.0) == Estimate(values[0])
-    assert probability_of_improvement(np.array(values), np.array([0.1, 0.2, 0.3])) is None
+    sides = np.array(values), np.array([0.1, 0.2, 0.3])
+    assert probability_of_improvement(*sides) is probability_of_improvement(*sides[::-1]) is None
 
 
 def test_equal_shares_have_an_interval_as_wide_as_drawing_their_episodes() -> None:
@@ -118,6 +119,8 @@ def test_a_difference_is_that_of_a_paired_t_test_on_the_seeds_that_both_have() -
     assert found is not None
     assert [found.value, found.low, found.high] == pytest.approx([(ours - theirs).mean(), expected.low, expected.high])
     assert paired_difference({0: 0.1}, {1: 0.2}) is None
+    clear = paired_difference({0: 1.0, 1: 0.9, 2: 0.9}, dict.fromkeys(range(3), 0.0), limit=1.0)
+    assert clear and clear.high == 1.0
 
 
 @pytest.mark.parametrize("scores", [[], [0.1, np.nan], [0.1, np.inf]])
@@ -198,11 +201,11 @@ def test_a_rate_is_corrected_by_what_the_prediction_explains() -> None:
     slope = covariance / variance / (1 + 5 / 20)
     assert slope == pytest.approx(0.08 / 0.048 / 1.25) and slope > 1
     slope = 1.0  # at most
-    value = 0.6 + slope * (0.4 - 0.6)
-    left = (np.sum((np.array(outcomes) - predicted - 0.0) ** 2) + 2 * 0.24) / (4 + 2) + 0.4 * 0.6 * 5 / 20
-    trials = 5 * 0.24 / left
+    value = 0.6 + slope * (0.5 - 0.6)
+    left = (np.sum((np.array(outcomes) - predicted - 0.0) ** 2) + 2 * 0.25) / (4 + 2) + 0.5 * 0.5 * 5 / 20
+    trials = 5 * 0.25 / left
     center, half = (value + 1.96**2 / 2 / trials), 1.96 * np.sqrt(value * (1 - value) / trials + (0.98 / trials) ** 2)
-    found = success_rate(outcomes, predicted, 0.4, 20)
+    found = success_rate(outcomes, predicted, 0.5, 20)
     expected = [value, *((center + side * half) / (1 + 1.96**2 / trials) for side in (-1, 1))]
     assert [found.value, found.low, found.high] == pytest.approx(expected, abs=1e-4)
     # A smaller slope is taken as it is; one below 0 is none.
