@@ -52,11 +52,10 @@ def check(
     verify: Annotated[bool, typer.Option("--verify", help="Read every byte, instead of comparing sizes.")] = False,
 ) -> None:
     """Check recipes, listing which artifacts are finished, damaged or stale; or tasks. Nothing is run."""
-    is_task = [":" in name or not (Path(name).suffix or Path(name).exists()) for name in recipes]
     faults: list[str] = []
-    for name, of_task in zip(recipes, is_task, strict=True):
+    for name in recipes:
         try:
-            if of_task:
+            if ":" in name or not (Path(name).suffix or Path(name).exists()):
                 _check_task(name)
             else:
                 faults += _check_recipe(Path(name), root, verify)

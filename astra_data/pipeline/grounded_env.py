@@ -108,12 +108,7 @@ def _world(
 
 
 def _planned(
-    run: str | Path,
-    settings: dict[str, Any],
-    stage: str,
-    row: str,
-    seed: int,
-    percent: int | None,
+    run: str | Path, settings: dict[str, Any], stage: str, row: str, seed: int, percent: int | None
 ) -> partial[object]:
     """Return the call by which a run with these `settings` makes the artifact of a row of others."""
     recipe = validated(settings | {"select": None}, Recipe, f"{run}")

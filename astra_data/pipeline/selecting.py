@@ -42,11 +42,9 @@ def select(
     """Judge every trained policy of a run, as the stage `select` does; a choice made of the same is kept."""
     folder, (recipe, config) = Path(run), asked_of(run, rows, judge, episodes)
     with alone_in(folder):
-        if not _is_current(folder, recipe, config) or choice.read_judged(folder) is None:
+        if not _is_current(folder, recipe, config):
             judge_all(recipe, config, root=folder, progress=progress)
-        judged = choice.read_judged(folder)
-    assert judged is not None
-    return judged
+        return read_json(choice.Judged, folder / choice.FOLDER / choice.SELECTED)
 
 
 def asked_of(

@@ -1,6 +1,7 @@
 """How good corrections are, and how much data is enough: errors on held-out episodes, without a target."""
 
 from collections.abc import Iterator, Sequence
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,10 +35,8 @@ def write_held_out(
 ) -> Path | None:
     """Write the page of all finished groundings to `root`, and a figure if they predict failures; None without one."""
     run = RunReader(root)
-    for row in groundings:
-        for percent in sorted(percents) or (None,):
-            for seed in sorted(seeds):
-                run.grounding(Owner(row, seed, percent))
+    for row, percent, seed in product(groundings, sorted(percents) or (None,), sorted(seeds)):
+        run.grounding(Owner(row, seed, percent))
     if not run.errors:
         return None
     parts: dict[str, Any] = {"timestep_s": timestep_s, "lines": run.lines, "errors": run.errors}
