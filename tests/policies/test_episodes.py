@@ -140,8 +140,7 @@ def constant(command: float, simulation: Simulation = SIMULATION) -> PolicyFile:
 
 def test_what_it_reaches_is_what_the_simulator_s_rule_says() -> None:
     """Forward at 0.4 m a step, goals from 1 to 2 m, uniform: 3, 4 or 5 steps; 4.2 on average."""
-    limited = constant(1.0, Simulation(WorldConfig(command_limit=0.5)))
-    assert running(CART, limited).command_limit == 0.5
+    assert running(CART, constant(1.0, Simulation(WorldConfig(command_limit=0.5)))).command_limit == 0.5
     reached = reached_in_own_world(CART, constant(1.0), NO_GROUNDING, seed=0)
     assert reached.success == 1.0 and reached.steps == pytest.approx(4.2, abs=0.2)
     # At 0.4 m/s goals up to 1.6 m are in reach in 4 s.

@@ -168,7 +168,7 @@ def restarted(
 
 
 def test_a_policy_that_masters_its_simulator_is_kept(tmp_path: Path) -> None:
-    command, curve, seeds = restarted(tmp_path, [1.0], tries=3)
+    command, curve, seeds = restarted(tmp_path, [1.0], tries=3, least_success=1.0)
     assert (command, seeds) == (1.0, SEEDS[:1])
     assert [(one["seed"], one["success"]) for one in curve["tries"]] == [(7, 1.0)]
     assert curve["points"] == curve["tries"][0]["points"]
@@ -191,8 +191,9 @@ def test_it_is_trained_again_until_it_does(tmp_path: Path) -> None:
 
 def test_of_those_that_do_not_the_best_is_kept(tmp_path: Path) -> None:
     # At 0.4 m/s, -0.44 of the range, goals up to 1.6 m are in reach within the 4 s of an episode.
-    command, curve, seeds = restarted(tmp_path, [-1.0, -0.44, -0.9], tries=3)
-    assert (command, seeds) == (-0.44, SEEDS) and 0.4 < curve["tries"][1]["success"] < 0.8
+    command, curve, seeds = restarted(tmp_path, [-0.9, -0.44, -0.44], tries=3)
+    success = [one["success"] for one in curve["tries"]]  # in the same episodes
+    assert (command, seeds) == (-0.44, SEEDS) and success[0] < 0.4 < success[1] == success[2] < 0.8
 
 
 def test_all_tries_cost_time(tmp_path: Path) -> None:
