@@ -11,7 +11,7 @@ from astra_data.grounding.descent import seeded
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.simulator import NO_GROUNDING, FittedGrounding, Grounding
 from astra_data.worlds.task import Task
-from astra_data.worlds.user_code import explained, parts_of, restored
+from astra_data.worlds.user_code import expect_tensor, explained, parts_of, restored
 
 if TYPE_CHECKING:
     from astra_data.grounding.alignment import TargetEncoder
@@ -102,15 +102,14 @@ def check_step(task: Task, fit: FittedGrounding, written: FittedGrounding, episo
             landed: object = simulator.step(action)
             reached = simulator.state
             landings.append(reached.clone())
-    got = tuple(landed.shape) if isinstance(landed, torch.Tensor) else f"a {type(landed).__name__}"
-    if not isinstance(landed, torch.Tensor) or landed.shape != state.shape:
+    moved = expect_tensor(what := f"{type(simulator).__name__}.step", landed)
+    wanted, got = (f"{one.dtype} of shape {tuple(one.shape)}" for one in (state, moved))
+    if got != wanted:
+        raise BadInputError(f"{what}: expected states, {wanted}, got {got}")
+    if not torch.allclose(reached, moved, rtol=_ROUNDING, atol=_ROUNDING, equal_nan=True):
+        apart = f"{(reached - moved).abs().max():.3g}"
         raise BadInputError(
-            f"{type(simulator).__name__}.step: expected states of shape {tuple(state.shape)}, got {got}"
-        )
-    if not torch.allclose(reached, landed, rtol=_ROUNDING, atol=_ROUNDING, equal_nan=True):
-        apart = f"{(reached - landed).abs().max():.3g}"
-        raise BadInputError(
-            f"{type(simulator).__name__}.step: returned states up to {apart} from its simulator's, which "
+            f"{what}: returned states up to {apart} from its simulator's, which "
             "would go on uncorrected: expected `return self._settle(before, corrected)`, which moves the "
             "simulator to the corrected states, as far as walls allow"
         )

@@ -31,6 +31,7 @@ from astra_data.core.naming import stage_of_key
 from astra_data.core.progress import Progress
 from astra_data.core.provenance import cores
 from astra_data.core.seeding import derive
+from astra_data.worlds.user_code import user_line
 
 SECONDS_BETWEEN_NOTES = 0.1
 CUDA_JOBS = 2  # items at a time on a CUDA device, where each process has its own context
@@ -133,7 +134,8 @@ def run_item(key: str, work: bytes, log: Path, send: Callable[[Note], object]) -
             if expected := error if isinstance(error, AstraDataError) else disk_error(error):
                 return type(expected)(f"{key}: {expected}")
             last = traceback.format_exception_only(error)[-1].strip()
-            return AstraDataError(f"{key} crashed: {last} (traceback: {log})")
+            where = f"{line}; " if (line := user_line(error)) else ""
+            return AstraDataError(f"{key} crashed: {last} ({where}traceback: {log})")
     return time.perf_counter() - began
 
 

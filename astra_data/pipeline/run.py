@@ -172,6 +172,7 @@ def check(recipe_path: Path, *, root: Path = RUNS, verify: bool = False) -> dict
     experiment = load_experiment(recipe_path, root)
     if not is_shipped(experiment.recipe.task):
         _check_task(experiment)
+    recorded_code(experiment.folder)  # refused where it is damaged
     data = data_condition(experiment.recipe)
     found = {key: condition(item, experiment, verify=verify) for key, item in experiment.items.items()}
     return found if data is None else {"data": data, **found}

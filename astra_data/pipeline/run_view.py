@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from astra_data.core.arrays import as_rows
 from astra_data.core.artifact import check_made_from
 from astra_data.core.config import validated
 from astra_data.core.durable import write_file
@@ -70,8 +71,8 @@ def view_run(run: Path, uids: Sequence[int] = (), *, seed: int | None = None, sa
         reason = str(error).partition("\n")[0]
         raise BadInputError(f"the viewer does not open ({reason}): {advice}") from error
 
-    def send(entity: str, column: Column, values: Array, color: str) -> None:
-        steps = np.arange(len(values))
+    def send(entity: str, column: Column, given: Array, color: str) -> None:
+        values, steps = as_rows(given), np.arange(len(given))
         times = rerun.TimeColumn("step", sequence=steps), rerun.TimeColumn("time", duration=steps / task.fps)
         for label, one in zip(column.labels, values.T.astype(np.float64), strict=True):
             stream.send_columns(f"{entity}/{label}", times, rerun.Scalars.columns(scalars=one))

@@ -27,6 +27,7 @@ from astra_data.reports import choice
 from astra_data.reports.artifacts import read_json
 from astra_data.reports.runs import Reported
 from astra_data.robots.registry import task_named
+from astra_data.worlds.task import Task
 
 _log = logging.getLogger(__name__)
 
@@ -85,6 +86,28 @@ def _is_current(folder: Path, recipe: Reported, config: SelectConfig) -> bool:
     return False
 
 
+def check_trials(run: str | Path, trials: int, *, by_hand: bool, field: int | None, percent: int | None) -> Task:
+    """Refuse so many trials before anything is judged anew or set aside; return the task of the run."""
+    folder, settings = Path(run), settings_of(run)
+    task, sizes = task_named(str(settings["task"])), settings.get("sweep", {}).get("percent") or [None]
+    if not by_hand and not task.has_target:
+        raise BadInputError(
+            f"{folder}: expected a task with a target, got {settings['task']}: leave out --trials, or make "
+            "them at the robot, with --by-hand"
+        )
+    if field is not None and field < 2:
+        raise BadInputError(f"--field: expected 2 candidates or more, got {field}")
+    if trials < (least := choice.least_trials(field or 2)):
+        raise BadInputError(
+            f"expected --trials of {least} or more, for a first round of {field or 2} candidates and those "
+            f"after it, got {trials}: give more, or another --field"
+        )
+    if percent not in sizes:
+        known = ", ".join(f"{size}" for size in sizes if size) or "none"
+        raise BadInputError(f"expected --percent to be a size of the run ({known}), got {percent or 'none'}")
+    return task
+
+
 def choose_by_trials(
     run: str | Path,
     trials: int,
@@ -101,22 +124,8 @@ def choose_by_trials(
 
     With `by_hand` a person makes them at the robot; what is returned has no `chosen` while any are still to be made.
     """
-    folder, task = Path(run), task_named(str(settings_of(run)["task"]))
-    if by_hand is None and not task.has_target:
-        raise BadInputError(
-            f"{folder}: expected a task with a target, got {settings_of(run)['task']}: leave out --trials, or make "
-            "them at the robot, with --by-hand"
-        )
-    least = choice.least_trials(max(2, field or 2))
-    if (field is not None and field < 2) or trials < least:
-        raise BadInputError(
-            f"expected --trials of {least} or more, for a first round of {field or 2} candidates and those "
-            f"after it, got {trials}: give more, or another --field of 2 or more"
-        )
+    folder, task = Path(run), check_trials(run, trials, by_hand=by_hand is not None, field=field, percent=percent)
     judged = select(run, rows=rows, judge=judge, episodes=episodes, progress=part(progress, 0.0, 0.5))
-    if percent not in judged.percents:
-        sizes = ", ".join(f"{size}" for size in judged.percents if size) or "none"
-        raise BadInputError(f"expected --percent to be a size of the run ({sizes}), got {percent or 'none'}")
     candidates = judged.ranked(percent)
     if not 2 <= (asked := field or len(candidates)) <= len(candidates):
         of = f"of the {len(candidates)} that were judged, got {asked}"
@@ -126,8 +135,7 @@ def choose_by_trials(
         trials=trials, field=field, percent=percent, by_hand=by_hand is not None, pseudo_trials=choice.PSEUDO_TRIALS
     )
     path = folder / choice.FOLDER / choice.TRIALS
-    there = read_json(choice.TrialsFile, path) if path.is_file() else None
-    if there:
+    if there := choice.read_trials(folder):
         for name, now in begun.model_dump(include={"trials", "field", "percent", "by_hand", "pseudo_trials"}).items():
             if (was := getattr(there, name)) != now:
                 raise BadInputError(

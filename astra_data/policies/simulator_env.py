@@ -7,6 +7,7 @@ import numpy as np
 
 from astra_data.core.arrays import Floats
 from astra_data.core.config import Config, NotNegative, Positive, Share
+from astra_data.core.errors import BadInputError
 from astra_data.core.lazy import Tensor, torch, without_gradients
 from astra_data.grounding.paired_episodes import RISK_STEPS, PairedEpisodes
 from astra_data.grounding.simulator import EpisodeSimulator, Grounding
@@ -140,13 +141,24 @@ class SimulatorEnv:
         if self.world.change_penalty:
             reward = reward - self.world.change_penalty * (command - self._command).square().sum(-1)
             self._command = command
+        self._refuse_not_finite("the reward", reward)
         return Step(self._observe(), reward, terminated=success | self.failed, success=success)
 
     def _observe(self) -> Tensor:
         simulator = self.simulator
         observation = policy_observation(self.objective, simulator.state, self.goal, simulator.latent)
+        self._refuse_not_finite("objective.observe", observation)
         shown = simulator.parameters if self._shows_parameters else None
         return observation if shown is None else torch.cat([observation, shown], dim=-1)
+
+    def _refuse_not_finite(self, maker: str, made: Tensor) -> None:
+        if not bool(made.isfinite().all()):
+            row = int((~made.isfinite()).view(len(made), -1).any(1).nonzero()[0])
+            wrong = float(made[~made.isfinite()][0])
+            raise BadInputError(
+                f"{maker}: expected finite numbers, got {wrong:g} for the abstract state "
+                f"{self.simulator.state[row].tolist()} and the goal {self.goal[row].tolist()}"
+            )
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return all that `load_state_dict` needs to continue from here."""

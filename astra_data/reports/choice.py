@@ -78,8 +78,8 @@ class TrialRound(WrittenPart):
     tried: list[Tried] = Field(default_factory=list)
 
 
-class TrialsFile(Artifact):
-    """trials.json: `trials` that may be spent on `field` candidates in the target, their rounds, and the one chosen."""
+class Trials(WrittenPart):
+    """The `trials` that may be spent on `field` candidates in the target, their rounds, and the one chosen."""
 
     trials: int
     field: int
@@ -95,6 +95,24 @@ class TrialsFile(Artifact):
     def spent(self) -> int:
         """The trials that were made."""
         return sum(len(one.success) for round_ in self.rounds for one in round_.tried)
+
+    @property
+    def choice(self) -> str:
+        """The one chosen and its success, in words; empty while there is none."""
+        if self.chosen is None or self.rate is None:
+            return ""
+        row, seed = self.chosen
+        return f"**{method_title(row)}, seed {seed}**: success {interval(Estimate(*self.rate))}"
+
+
+class TrialsFile(Trials, Artifact):
+    """trials.json: the trials, and where they were made."""
+
+
+def read_trials(root: Path) -> TrialsFile | None:
+    """Read the trials in a run's folder; None if none were begun."""
+    path = root / FOLDER / TRIALS
+    return read_json(TrialsFile, path) if path.is_file() else None
 
 
 def read_judged(root: Path) -> "Judged | None":
@@ -238,7 +256,7 @@ def choice_blocks(choice: Choice, shown: int | None = None) -> list[Text | Table
     return blocks
 
 
-def select_page(recipe: str, judged: Judgment, trials: TrialsFile | None = None) -> str:
+def select_page(recipe: str, judged: Judgment, trials: Trials | None = None) -> str:
     """Return the page of all candidates, size by size, and of trials in the target where there are any."""
     sections = [
         Section(f"{percent} %" if percent else "", choice_blocks(choice))
@@ -246,7 +264,7 @@ def select_page(recipe: str, judged: Judgment, trials: TrialsFile | None = None)
         if (choice := choice_of(judged, percent, measured={}))
     ]
     if trials:
-        sections.append(Section("Trials in the target", _trial_blocks(judged, trials)))
+        sections.append(Section("Trials in the target", trial_blocks(judged, trials)))
     return markdown(f"{recipe}: choice without the target", sections)
 
 
@@ -273,7 +291,7 @@ def standings(judged: Judgment, percent: int | None, rounds: Sequence[TrialRound
     return found
 
 
-def advice(judged: Judgment, trials: TrialsFile) -> str:
+def advice(judged: Judgment, trials: Trials) -> str:
     """Return in a sentence who is ahead by how much, and whether more trials could change that."""
     if not trials.spent:
         return "Nothing is tried yet."
@@ -289,7 +307,8 @@ def advice(judged: Judgment, trials: TrialsFile) -> str:
     return f"{text}. {rival.name}, with {interval(rival.rate)}, may be as good{go_on}."
 
 
-def _trial_blocks(judged: Judgment, trials: TrialsFile) -> list[Text | TableBlock]:
+def trial_blocks(judged: Judgment, trials: Trials) -> list[Text | TableBlock]:
+    """Return what a page says of trials in the target: how they end, and where each candidate stood by round."""
     lines = list[list[str]]()
     for number, round_ in enumerate(trials.rounds, start=1):
         found = standings(judged, trials.percent, trials.rounds[:number])
@@ -297,11 +316,8 @@ def _trial_blocks(judged: Judgment, trials: TrialsFile) -> list[Text | TableBloc
             if stands := found.get((one.row, one.seed)):
                 cells = (f"{number}", method_title(one.row), f"{one.seed}", f"{sum(one.success)}")
                 lines.append([*cells, f"{len(one.success)}", f"{stands.mean:.2f}", interval(stands.rate)])
-    if trials.chosen and trials.rate:
-        row, seed = trials.chosen
-        state = f"**{method_title(row)}, seed {seed}**: success {interval(Estimate(*trials.rate))}."
-    else:
-        state = f"Not finished: run the same command again. {advice(judged, trials)}"
+    choice = trials.choice
+    state = f"{choice}." if choice else f"Not finished: run the same command again. {advice(judged, trials)}"
     size = f" at {trials.percent} %" if trials.percent else ""
     narrower = " that predictions of the same trials make narrower (control variate)" if trials.by_hand else ""
     return [

@@ -10,7 +10,7 @@ from astra_data.core.naming import base_method, in_code, is_plus, reference_of
 from astra_data.core.progress import CLOCKS
 from astra_data.methods import grounded_as, method_named, method_role, method_title
 from astra_data.reports.blocks import Block, Code, Section, TableBlock, Text, duration
-from astra_data.reports.choice import choice_blocks
+from astra_data.reports.choice import choice_blocks, trial_blocks
 from astra_data.reports.figures.catalog import pictures
 from astra_data.reports.held_out import gap_blocks
 from astra_data.reports.results import SIMULATED, TESTED, WHOLE, Origin, Results, elapsed_seconds, stage_seconds, titled
@@ -72,6 +72,8 @@ def sections_of(results: Results, run: str) -> list[Section]:
         sections.append(Section("Size of the data", [*_sizes(results)]))
     if choice := results.choice():
         sections.append(Section("Chosen without the target", choice_blocks(choice, shown=8)))
+        if results.trials:
+            sections.append(Section("Trials in the target", trial_blocks(choice.judged, results.trials)))
     return [
         *sections,
         Section("Training and cost", [*pictures(results, "training"), *_costs(results)]),

@@ -16,7 +16,7 @@ from astra_data.core.naming import reference_of
 from astra_data.grounding.paired_episodes import BINS
 from astra_data.methods import grounded_as, method_role, method_title
 from astra_data.reports.artifacts import Machine
-from astra_data.reports.choice import Choice, Judgment, choice_of
+from astra_data.reports.choice import Choice, Judgment, Trials, choice_of
 from astra_data.reports.statistics import Estimate, paired_difference, summarize
 from astra_data.worlds.objective import SUCCESS, Score
 
@@ -110,6 +110,7 @@ class Results(Facts):
     stand_in: str | None = None  # the simulator that stands in for a physical robot in the target, if any
     paper_success: dict[str, float] = Field(default_factory=dict)  # method → what the paper prints
     judged: Judgment | None = None  # the choice without the target; None where `select` was not run
+    trials: Trials | None = None  # in the target, that end it; None where there were none
     settings: dict[str, JsonValue] = Field(default_factory=dict)  # all settings of the recipe, with defaults filled in
     origins: list[Origin] = Field(default_factory=list)  # normally one; more if code or machine changed between stages
     user_code: dict[str, str] = Field(default_factory=dict)  # digests: "task", and methods by name
@@ -304,6 +305,7 @@ def merge(sources: Sequence[Results]) -> Results:
         update={
             "rows": tuple(dict.fromkeys([*last.rows, *(row for one in sources for row in one.rows)])),
             "judged": judged[-1].model_copy(update={"candidates": [*candidates.values()]}) if judged else None,
+            "trials": next((one.trials for one in reversed(sources) if one.trials), None),
             "origins": merged_origins(origin for one in sources for origin in one.origins),
             "user_code": {name: digest for one in sources for name, digest in one.user_code.items()},
             "datasets": _datasets(sources),

@@ -148,6 +148,8 @@ def _lost(results: Results, row: str) -> Iterator[str]:
 def _limits(results: Results, best: str) -> Iterator[str]:
     """Yield what limits the comparison."""
     worth, choice = results.score_of(best), results.choice()
+    if results.trials and results.trials.choice:
+        yield f"{results.trials.spent} trials in the target choose {results.trials.choice}."
     if worth and worth.seeds < LEAST_SEEDS:
         yield f"Intervals are not shown: they need {LEAST_SEEDS} seeds, {method_title(best)} has {worth.seeds}."
     if choice and results.tested_in == "target" and choice.best.row != best:

@@ -5,7 +5,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
-from numbers import Integral
+from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, cast
 
@@ -113,6 +113,10 @@ class RobotEnv:
                 found = self._robots[row].step(commands[row])
             if not isinstance(found, tuple) or len(found) != 2:
                 raise BadInputError(f"step of the robot: expected (state, whether it failed), got {found!r}")
+            if found[1] not in (True, False):
+                raise BadInputError(
+                    f"step of the robot: expected True or False for whether it failed, got {found[1]!r}"
+                )
             self._steps[row] += 1
             self._state[row], self._fell[row] = self._checked(found[0], "step", row), bool(found[1])
         after = self._abstract()
@@ -229,6 +233,12 @@ class Varied:
     wide: Variation  # what COMPASS varies or identifies, and RMA adapts to, of the kind of all parameters
 
 
+_KINDS: tuple[tuple[str, Any, str], ...] = (
+    ("name", str, "a text"),
+    ("timestep_s", Real, "a number of seconds"),
+    ("commands", Mapping | str | Path, "(least, largest) by name, or a dataset"),
+    ("objective", Objective, "an object of a class that derives from astra_data.Objective"),
+)  # of what the rest of a task is made from
 _DERIVED: Any = None  # from other fields
 _BALL = "ball_position_m"  # the quantity of what the robot kicks or pushes
 
@@ -295,6 +305,13 @@ class Task:
         for one in fields(self):
             if one.name in self.derived and getattr(self, one.name) is self.derived[one.name]:
                 object.__setattr__(self, one.name, one.default)
+        for name, kind, expected in _KINDS:
+            if not isinstance(given := getattr(self, name), kind):
+                raise BadInputError(f"task: {name}: expected {expected}, got {given!r}")
+        if not hasattr(self.objective, "action_size"):
+            raise BadInputError(
+                f"task: {_named(type(self.objective))}: expected an action_size, the number of commands"
+            )
         made = self.make_simulator
         while isinstance(made, partial):
             made = made.func

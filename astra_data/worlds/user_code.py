@@ -140,12 +140,20 @@ def _place(error: BaseException) -> str:
     """Return the file and line of the user's code at which `error` was raised; nothing where the message has it."""
     if isinstance(error, SyntaxError):
         return ""
-    users = {module.__file__ for name, module in sys.modules.items() if name.startswith(_PREFIX)}
-    frames = traceback.extract_tb(error.__traceback__)
-    last = next((frame for frame in reversed(frames) if frame.filename in users), frames[-1])
+    if where := user_line(error):
+        return f" ({where})"
+    last = traceback.extract_tb(error.__traceback__)[-1]
     if last.filename.startswith("<frozen") or Path(last.filename).is_relative_to(_PACKAGE):
         return ""
     return f" ({Path(last.filename).name}, line {last.lineno})"
+
+
+def user_line(error: BaseException) -> str:
+    """Return the last file of the user's that an `error` went through, and the line; empty where none is known."""
+    users = {module.__file__ for name, module in sys.modules.items() if name.startswith(_PREFIX)}
+    frames = traceback.extract_tb(error.__traceback__)
+    places = [f"{Path(one.filename).name}, line {one.lineno}" for one in frames if one.filename in users]
+    return places[-1] if places else ""
 
 
 def code_digest(name: str) -> str | None:
@@ -303,4 +311,4 @@ def paid(objective: Objective, before: Tensor, after: Tensor, goal: Tensor, fail
     """Return the rewards (B,) of steps between states (B, X)."""
     what = "objective.reward(before, after, goal, failed)"
     found = answered(what, objective.reward, before, after, goal, failed)
-    return expect(what, found, (len(after),), device=after.device)
+    return expect(what, found, (len(after),), torch.float32, after.device)

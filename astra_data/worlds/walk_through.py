@@ -125,7 +125,7 @@ def _simulator(task: Task, device: str) -> AbstractSimulator:
     with explained(what):
         simulator = task.own_simulator(_COUNT, device)
         state = simulator.state
-    expect(f"{what}.state, {_COUNT} states at once", state, (_COUNT, task.abstract_state.size))
+    expect(f"{what}.state, {_COUNT} states at once", state, (_COUNT, task.abstract_state.size), torch.float32)
     return simulator
 
 
@@ -158,7 +158,8 @@ def _moved(task: Task, simulator: AbstractSimulator, starts: Tensor) -> Tensor:
 
 def _observation(task: Task, _: Tensor, state: Tensor, goal: Tensor) -> None:
     what = "objective.observe(state, goal)"
-    expect(what, answered(what, task.objective.observe, state, goal), (_COUNT, -1), device=state.device)
+    seen = answered(what, task.objective.observe, state, goal)
+    expect(what, seen, (_COUNT, -1), torch.float32, state.device)
 
 
 def _places(task: Task, _: Tensor, state: Tensor, goal: Tensor) -> None:
@@ -171,5 +172,7 @@ def _places(task: Task, _: Tensor, state: Tensor, goal: Tensor) -> None:
 def _judgement(task: Task, before: Tensor, after: Tensor, goal: Tensor) -> None:
     for name in ("reached", "missed"):
         judged(task.objective, name, after, goal)
+    if judged(task.objective, "missed", before, goal).all():
+        raise BadInputError(f"objective.missed: expected False where episodes start, got True for {before.tolist()}")
     for failed in (False, True):
         paid(task.objective, before, after, goal, torch.full((_COUNT,), failed, device=after.device))

@@ -143,9 +143,19 @@ RAIL = f"{Path(__file__).parents[1] / 'small_cart.py'}:TASK"
 @pytest.mark.parametrize(
     ("landed", "told"),
     [
-        (lambda self, action: self.simulator.step(action)[:, :0], r"expected states of shape \(2, 1\), got \(2, 0\)"),
-        (lambda self, action: self.simulator.step(action)[:1], r"expected states of shape \(2, 1\), got \(1, 1\)"),
-        (lambda self, action: None, r"expected states of shape \(2, 1\), got a NoneType"),
+        (
+            lambda self, action: self.simulator.step(action)[:, :0],
+            r"expected states, torch.float32 of shape \(2, 1\), got torch.float32 of shape \(2, 0\)",
+        ),
+        (
+            lambda self, action: self.simulator.step(action).double(),
+            r"expected states, torch.float32 of shape \(2, 1\), got torch.float64 of shape \(2, 1\)",
+        ),
+        (
+            lambda self, action: self.simulator.step(action)[:1],
+            r"expected states, torch.float32 of shape \(2, 1\), got torch.float32 of shape \(1, 1\)",
+        ),
+        (lambda self, action: None, "expected a torch tensor, got a NoneType"),
     ],
 )
 def test_a_step_that_is_no_states_is_refused(

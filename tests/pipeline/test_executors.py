@@ -68,6 +68,10 @@ def prepared() -> None:
     os.write(2, b"with care\n")
 
 
+def user_call(place: str, *, progress: object) -> None:
+    user_object(place)(progress)
+
+
 def test_what_an_item_prints_is_in_its_log_and_an_empty_log_is_removed(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -83,6 +87,13 @@ def test_what_an_item_prints_is_in_its_log_and_an_empty_log_is_removed(
     os.write(2, b"and ours\n")
     shown = capfd.readouterr()
     assert "ours again\n" in shown.out and "and ours\n" in shown.err and "with care" not in shown.err
+
+
+def test_a_crash_of_the_users_code_names_its_line(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text("def METHOD(progress):\n    return 1 / 0\n")
+    log, work = tmp_path / "d.txt", partial(user_call, f"{tmp_path}/mine.py:METHOD")
+    error = run_item("d", pickled(Item("d", (), work), None), log, lambda note: None)
+    assert str(error) == f"d crashed: ZeroDivisionError: division by zero (mine.py, line 2; traceback: {log})"
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="measures memory in /proc")

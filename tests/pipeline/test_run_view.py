@@ -10,6 +10,7 @@ import pytest
 import torch
 from command_line import call
 from quick_runs import fit_quickly, run_here
+from rail_run import rail_run
 from recordings_of_rerun import read, scalars
 
 from astra_data.core.errors import BadInputError
@@ -18,6 +19,7 @@ from astra_data.grounding.files import load_grounding
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.model import GroundingModel
 from astra_data.pipeline.run_view import view_run
+from astra_data.pipeline.trained_policy import settings_of
 from astra_data.robots.registry import task_named
 
 CART = Path(__file__).parents[2] / "recipes/examples/cart"
@@ -115,6 +117,19 @@ def test_episodes_are_chosen_by_their_uids(run: Path, tmp_path: Path) -> None:
     uid = max(uid for uid, _, _ in recorded_steps(run))
     view_run(run, [uid], save=tmp_path / "one.rrd")
     assert shown(read(tmp_path / "one.rrd")) == {uid}
+
+
+def test_states_of_one_value_are_shown(tmp_path_factory: pytest.TempPathFactory, tmp_path: Path) -> None:
+    rail = rail_run(tmp_path_factory, seeds=[0], methods=["nas"])
+    [label] = task_named(settings_of(rail)["task"]).abstract_state.labels
+    view_run(rail, save=tmp_path / "rail.rrd")
+    recording = read(tmp_path / "rail.rrd")
+    uids = Dataset.open(rail / "pair/seed_0").uids.tolist()
+    for row, episode in enumerate(Dataset.open(rail / "pair/seed_0").episodes()):
+        if uids[row] in shown(recording):
+            found = scalars(recording[f"/episode_{uids[row]}/target/{label}"])
+            np.testing.assert_allclose(found[:-1], episode.columns["abstract.state"].ravel(), atol=1e-6)
+    assert shown(recording)
 
 
 @pytest.mark.parametrize(

@@ -152,7 +152,7 @@ def test_what_trials_cannot_be_made_of_is_refused(folder: Path, tries: Tries) ->
         choose_by_trials(folder, 3)
     with pytest.raises(BadInputError, match=r"--trials of 12 or more, for a first round of 4 .* got 11"):
         choose_by_trials(folder, 11, field=4)
-    with pytest.raises(BadInputError, match=r"another --field of 2 or more"):
+    with pytest.raises(BadInputError, match=r"--field: expected 2 candidates or more, got 1"):
         choose_by_trials(folder, 30, field=1)
     with pytest.raises(BadInputError, match=r"of the 6 that were judged, got 7: give another --field"):
         choose_by_trials(folder, 300, field=7)
@@ -244,6 +244,8 @@ def test_trials_by_hand_are_filled_into_the_sheet(folder: Path, predicted: list[
     shown = CliRunner().invoke(app, command)  # without a terminal
     assert shown.exit_code == 0, shown.output
     assert "round 1, trial 1 of 4: run " in shown.output and "0 trials are made: fill in trials.csv" in shown.output
+    refused = CliRunner().invoke(app, [*command[:-1], "3", "--row", "nas"])
+    assert refused.exit_code == 1 and not (folder / "set_aside").exists()
     lines = sheet.read_text().splitlines()
     voids, done = [line + "void" for line in lines[1:3]], [line + "s" for line in lines[1:]]
     sheet.write_text("\n".join([lines[0], *voids, *done]))
@@ -310,6 +312,7 @@ def test_trials_are_of_the_size_that_is_asked_for(folder: Path, tries: Tries, mo
     judged, made, loaded = select(folder), trained_policy, list[int | None]()
     sized = [one.model_copy(update={"percent": size}) for size in (50, 100) for one in judged.candidates]
     both = judged.model_copy(update={"candidates": sized})
+    settings = recorded_settings(folder)
 
     def noted(run: Path, row: str, *, seed: int, percent: int | None = None) -> TrainedPolicy:
         loaded.append(percent)
@@ -317,13 +320,20 @@ def test_trials_are_of_the_size_that_is_asked_for(folder: Path, tries: Tries, mo
 
     monkeypatch.setattr(module, "trained_policy", noted)
     monkeypatch.setattr(module, "select", lambda *_, **__: both)
+    monkeypatch.setattr(module, "settings_of", lambda _: settings | {"sweep": {"percent": [50, 100]}})
     with pytest.raises(BadInputError, match=r"a size of the run \(50, 100\), got none"):
         choose_by_trials(folder, 20, field=4)
     found = choose_by_trials(folder, 20, field=4, percent=50)
     assert found.percent == 50 and loaded == [50] * 6
     assert found.rounds[0].candidates == [(one.row, one.seed) for one in both.ranked(50)[:4]]
+    by_hand = Mock(return_value=found)
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "choose_by_trials", by_hand)
+        CliRunner().invoke(app, ["select", str(folder), "--trials", "20", "--by-hand", "--percent", "50"])
+    assert by_hand.call_args.kwargs["percent"] == 50
     with pytest.raises(BadInputError, match=r"with percent = 100, found 20 made with 50: use the same settings"):
         choose_by_trials(folder, 20, field=4, percent=100)
+    monkeypatch.setattr(module, "settings_of", lambda _: settings)
     alone = judged.model_copy(update={"candidates": judged.candidates[:1]})
     monkeypatch.setattr(module, "select", lambda *_, **__: alone)
     with pytest.raises(BadInputError, match=r"two candidates or more to try, of the 1 that were judged"):

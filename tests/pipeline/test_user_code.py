@@ -13,7 +13,7 @@ from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.core.naming import CODE
 from astra_data.pipeline.experiment import load_experiment
 from astra_data.pipeline.grounded_env import grounded
-from astra_data.pipeline.run import run
+from astra_data.pipeline.run import check, run
 from astra_data.pipeline.trained_policy import load_policy, settings_of
 from astra_data.pipeline.user_code import check_unchanged
 from astra_data.robots import registry
@@ -146,5 +146,7 @@ def test_a_damaged_record_is_told(text: str, made: Path) -> None:
     record.write_text(text)
     with pytest.raises(BadInputError, match=r"rail/code\.json is not what a run writes: .*; restore it"):
         settings_of(made / "runs/rail")
+    with pytest.raises(BadInputError, match=r"rail/code\.json is not what a run writes"):
+        check(made / "rail.toml", root=made / "runs")
     record.unlink()
     settings_of(made / "runs/rail")

@@ -5,6 +5,7 @@ import pytest
 import torch
 from toy_episodes import toy_episodes
 
+from astra_data.core.errors import BadInputError
 from astra_data.grounding.failures import FailureModel, FailureShape, averages_before
 from astra_data.grounding.history import GroundedSimulator, HistoryGrounding
 from astra_data.grounding.model import GroundingModel, GroundingShape
@@ -58,6 +59,23 @@ def test_observations_are_scaled_positions_velocity_and_the_way_to_the_goal() ->
     assert seen[0].tolist() == pytest.approx([0.5, -1.0, 0.5, -0.5, -0.4, 0.4, -0.9, 1.4])
     with_latent = simulator_env.policy_observation(NAVIGATION, state, goal, torch.tensor([[7.0, 1.0, -5.0, 5.0]]))
     assert with_latent.tolist() == [[3.5, 0.5, -2.5, 2.5, *seen[0].tolist()]]
+
+
+@pytest.mark.parametrize(("function", "told"), [("observe", "objective.observe"), ("reward", "the reward")])
+def test_what_is_not_finite_is_told_with_its_state(function: str, told: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    env, made = world(), getattr(Navigation, function)
+    env.reset()
+
+    def sometimes(self: Navigation, *given: torch.Tensor) -> torch.Tensor:
+        found: torch.Tensor = made(self, *given)
+        found[2] = -torch.inf
+        return found
+
+    monkeypatch.setattr(Navigation, function, sometimes)
+    with pytest.raises(BadInputError) as caught:
+        env.step(torch.zeros(4, 2))
+    where = f"state {env.simulator.state[2].tolist()} and the goal {env.goal[2].tolist()}"
+    assert str(caught.value) == f"{told}: expected finite numbers, got -inf for the abstract {where}"
 
 
 def test_it_resumes_where_it_was_from_a_state_that_stays_as_it_was() -> None:

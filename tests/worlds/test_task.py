@@ -14,6 +14,7 @@ from astra_data.methods.follower import careful
 from astra_data.pipeline.stages.collect import WallWatch
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.commands import DrivenSimulator
+from astra_data.worlds.objective import Objective
 from astra_data.worlds.plane.mazes import U_MAZE
 from astra_data.worlds.task import ColumnEntry, Task, column, free_body, names_with_units
 
@@ -152,6 +153,9 @@ def test_a_task_without_a_target_says_so() -> None:
         LOGS_ALONE.target(1, seed=0)
 
 
+UNSIZED = type("Unsized", (Objective,), dict.fromkeys(Objective.__abstractmethods__))
+
+
 @pytest.mark.parametrize(
     ("wrong", "told"),
     [
@@ -162,6 +166,14 @@ def test_a_task_without_a_target_says_so() -> None:
         ),
         ({"action": Column("action", size=2)}, "action: 2 values, expected 1"),
         ({"goal": Column("observation.environment_state", size=2)}, "goal: 2 values, expected 1"),
+        ({"timestep_s": "0.1"}, "timestep_s: expected a number of seconds, got '0.1'"),
+        ({"name": 3}, "name: expected a text, got 3"),
+        ({"commands": [(0.0, 1.0)]}, r"commands: expected \(least, largest\) by name, or a dataset, got \[\(0"),
+        (
+            {"objective": Reach},
+            "objective: expected an object of a class .*Objective, got <class",
+        ),
+        ({"objective": UNSIZED(horizon=9)}, "Unsized: expected an action_size, the number of commands"),
         ({"timestep_s": 2.0}, "timestep_s: expected above 0 and below 2 s.*: got 2.0"),
         ({"name": "my rail"}, "name: expected letters, digits"),
         ({"objective": Reach(horizon=0)}, "objective: horizon 0, expected 1 step or more"),

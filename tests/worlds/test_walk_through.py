@@ -90,6 +90,14 @@ class Own:
 
 WRONG: list[tuple[Task, str]] = [
     (robot(step=lambda self, command: 1 / 0), "step of the robot fails with ZeroDivisionError"),
+    (
+        robot(step=lambda self, command: ([0.0, 0.0], "no")),
+        "step of the robot: expected True or False for whether it failed, got 'no'",
+    ),
+    (
+        simulator(state=property(lambda self: torch.zeros(3, 1, dtype=torch.double), lambda self, _: None)),
+        "make_simulator(3).state, 3 states at once: expected torch.float32, got torch.float64",
+    ),
     (simulator(__init__=Own.single), "make_simulator(3).state, 3 states at once: expected shape (3, 1), got (1,)"),
     (simulator(reset_to=Own.deaf), "make_simulator: after reset_to(state), state: expected 3 in row 2, entry 0, got 0"),
     (
@@ -101,6 +109,18 @@ WRONG: list[tuple[Task, str]] = [
     (
         objective(reward=lambda self, before, after, goal, failed: after - before),
         "objective.reward(before, after, goal, failed): expected shape (3,), got (3, 1)",
+    ),
+    (
+        objective(reward=lambda self, before, after, goal, failed: (after - before)[:, 0].double()),
+        "objective.reward(before, after, goal, failed): expected torch.float32, got torch.float64",
+    ),
+    (
+        replace(objective(observe=lambda self, state, goal: state.double()), robot=None),
+        "objective.observe(state, goal): expected torch.float32, got torch.float64",
+    ),
+    (
+        objective(missed=lambda self, state, goal: state[:, 0] < 5.0),
+        "objective.missed: expected False where episodes start, got True for [[1.0], [2.0], [3.0]]",
     ),
     (
         objective(reached=lambda self, state, goal: state[:, 0].clamp(0, 1)),

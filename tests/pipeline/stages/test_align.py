@@ -45,6 +45,22 @@ def test_the_target_encoder_comes_closer_to_the_source(aligned: Path, grounded: 
     assert metrics["deployed"] == ("target" if metrics["latent_r2"] >= 0.9 else "source")
 
 
+def test_the_weights_with_the_least_held_out_error_are_kept(
+    paired: Path, grounded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    errors, seen = iter((1.0, 2.0, 3.0)), list[dict[str, torch.Tensor]]()
+
+    def measured(_: object, encoder: TargetEncoder, *__: object) -> dict[str, float]:
+        seen.append({name: values.clone() for name, values in encoder.encoder.state_dict().items()})
+        return {"mmd": next(errors), "latent_rmse": 0.0, "latent_r2": 0.5}
+
+    monkeypatch.setattr("astra_data.pipeline.stages.align._agreement", measured)
+    align(ALIGN, dataset=paired, grounding=grounded, out=tmp_path / "aligned")
+    kept = load_target_encoder(tmp_path / "aligned/target_encoder.safetensors").encoder.state_dict()
+    first, second, last = (all(torch.equal(kept[name], one[name]) for name in kept) for one in seen)
+    assert first and not second and last
+
+
 def test_the_agreement_is_that_of_held_out_episodes_alone(paired: Path, grounded: Path, aligned: Path) -> None:
     model = load_history_model(grounded / "grounding.safetensors")
     encoder = load_target_encoder(aligned / "target_encoder.safetensors")

@@ -160,8 +160,15 @@ def test_publishing_adds_to_what_is_there(
 
 def test_a_choice_without_the_target_is_reported_and_stays_published(root: Path, tmp_path: Path) -> None:
     write_choice(root)
+    tried = [{"row": row, "seed": seed, "success": [1, 1]} for row, seed in (("astra", 2), ("astra_plus", 0))]
+    rounds = [{"trials": 2, "candidates": [("astra", 2), ("astra_plus", 0)], "tried": tried}]
+    trials = {"trials": 4, "field": 2, "pseudo_trials": 4, "rounds": rounds}
+    write_json(root / "select/trials.json", trials | {"chosen": ("astra_plus", 0), "rate": (1.0, 0.25, 1.0)})
     make(root, tmp_path / "results")
     page = (tmp_path / "results/antmaze_u/results.md").read_text()
+    in_target = "**ASTRA+, seed 0**: success 1.00 [0.25, 1.00]."
+    assert f"- 4 trials in the target choose {in_target}\n" in page
+    assert f"## Trials in the target\n\n{in_target} 4 of 4 episodes" in page
     assert "**ASTRA, seed 2**, chosen from 6 policies: predicted success 1.00 [" in page
     assert "| ASTRA | 3 | +0.40 | 0.40 |" in page and "| ASTRA+ | 3 | -0.58 | 0.58 |" in page
     # ASTRA has 0.5, 0.25 and 0.75 in the target, its ranks are right; the best there is ASTRA+ with 1.
@@ -171,7 +178,8 @@ def test_a_choice_without_the_target_is_reported_and_stays_published(root: Path,
     assert manifest and manifest.made_from["select"] == file_digest(root / "select/select.json")
     shutil.rmtree(root / "select")
     make(root, tmp_path / "results", published=(tmp_path / "results/antmaze_u/results.json",))
-    assert "**ASTRA, seed 2**, chosen from 6" in (tmp_path / "results/antmaze_u/results.md").read_text()
+    page = (tmp_path / "results/antmaze_u/results.md").read_text()
+    assert "**ASTRA, seed 2**, chosen from 6" in page and "## Trials in the target" in page
 
 
 def test_sizes_are_set_side_by_side(rough: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
