@@ -20,6 +20,7 @@ from astra_data.dataset.columns import (
     SUCCESS,
     TERMINATED,
     TRUNCATED,
+    Clip,
     Column,
     Episode,
 )
@@ -71,6 +72,9 @@ def test_what_the_log_lacks_is_what_the_task_computes(tmp_path: Path) -> None:
     assert labeled.metadata["return"] == pytest.approx([0.5, 10 + 0.4 * len(fast)], abs=1e-5)
     assert labeled.description["dropped_steps"] == 10 - len(fast) and labeled.reference == "logs@data-2.0.0"
     assert notes[-1] == f"1 successes, 0 failures in {10 + len(fast)} steps"
+    filmed = Episode(1, drive(4.0, 10), {}, {"front": Clip(tmp_path / "a.mp4", "front", 0.0, 0.1, 10)})
+    cut = with_outcomes(task_named(CART), filmed, 0)
+    assert cut.cameras["front"].count == len(cut) < 10
 
 
 def test_steps_that_do_not_lead_to_the_next_row_are_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
