@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 
-from astra_data.core.arrays import Floats, Ints
+from astra_data.core.arrays import Bools, Floats, Ints
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.checkup import ANGLE, LARGEST, is_angle
 from astra_data.dataset.columns import ACTION, GOAL, STATE, SUCCESS, TERMINATED, TIMESTAMP
@@ -39,10 +39,13 @@ COMMAND, TORQUE, FORCE = (
     re.compile(rf"{words}(_.+|\d+)?")
     for words in (rf"((.+_)?({COMMANDED})|u)", "(.+_)?(tau|torque|effort|moment)", "(.+_)?(force|thrust)")
 )
-ACTING = (TORQUE, FORCE, re.compile(r"throttle|brake|steer(ing)?(_angle)?"))
+ACTING = (TORQUE, FORCE, re.compile(r"throttle|brake|(steer(ing)?|rudder|aileron|elevator)(_angle)?"))
 NO_PLACE = f"{TURNED}|quat|orient|vel|twist|linear|angular|speed|acc|rate|force|torque|moment"
-PLACE = re.compile(rf"(?!.*({NO_PLACE}))(.+_)?(p|pos)?(?P<axis>[xyz]|east(ing)?|north(ing)?|up|alt(itude)?|depth)")
+PLACE = re.compile(
+    rf"(?!.*({NO_PLACE})|(.+_)?q_)(.+_)?(p|pos)?(?P<axis>[xyz]|east(ing)?|north(ing)?|up|alt(itude)?|depth)"
+)
 GPS = re.compile(r"(?P<stem>(.+_)?)(?P<axis>lat|lon|lng)(itude|gitude)?")
+GAP_STEPS = 5  # periods without a row after which another episode begins
 GOAL_NAME = re.compile(
     r"(?!.*(dist|bearing|_to_|_from_))(.+_)?(goal|destination|waypoint)"
     r"(?P<axis>_(x|y|z|yaw|heading|theta|psi|east|north|lat(itude)?|lon(gitude)?))?|"
@@ -158,7 +161,10 @@ def guess(paths: Sequence[Path]) -> Logs:
     fields = _places(_roles(_times(first, fields, raw)), raw)
     for time in (field for field in fields if field.role == "time"):
         _check_rates(sources, [np.diff(table[time.name]) * time.scale for table in tables])
-        raw = [part for one in raw for part in _cut(one, 1 + np.flatnonzero(np.diff(one[time.name]) < 0))]
+        steps = _steps(raw, time)
+        longest = GAP_STEPS * np.median(steps[steps > 0])
+        begins = [1 + np.flatnonzero((of < 0) | (of > longest)) for of in (np.diff(one[time.name]) for one in raw)]
+        raw = [part for one, rows in zip(raw, begins, strict=True) for part in _cut(one, rows)]
     for role, example in (("command", "cmd_v"), ("state", "x")):
         if role not in [field.role for field in fields]:
             listed = ", ".join(f"{field.name} ({field.role})" for field in fields)
@@ -166,14 +172,14 @@ def guess(paths: Sequence[Path]) -> Logs:
     needed = [field.name for field in fields if field.role in ("time", "state", "command")]
     gaps = {name: gap for name in needed if (gap := sum(int((~np.isfinite(one[name])).sum()) for one in raw))}
     rows = [np.isfinite([one[name] for name in needed]).all(axis=0) for one in raw]
-    if all(kept.sum() < 2 for kept in rows):
+    if not any(map(_runs, rows)):
         cut = [field.name for field in fields if field.role == "episode" or field.name in gaps]
         why = f"look at {' and '.join(cut)}, which cut or lack rows" if cut else "record longer"
         raise BadInputError(f"{first}: expected episodes of two rows or more, found none: {why}")
     scaled = [
-        {field.name: (one[field.name] * field.scale + field.offset)[kept] for field in fields}
+        {field.name: one[field.name][run] * field.scale + field.offset for field in fields}
         for one, kept in zip(raw, rows, strict=True)
-        if kept.any()
+        for run in _runs(kept)
     ]
     cut_off = [str(source.path) for source, is_torn in zip(sources, torn, strict=True) if is_torn]
     logs = Logs(tuple(fields), tuple(scaled), gaps, tuple(cut_off))
@@ -207,6 +213,12 @@ def _cut(table: dict[str, Floats], begins: Ints) -> list[dict[str, Floats]]:
     """Cut rows where others begin."""
     cuts = sorted({0, len(next(iter(table.values()))), *begins.tolist()})
     return [{name: values[a:b] for name, values in table.items()} for a, b in pairwise(cuts)]
+
+
+def _runs(kept: Bools) -> list[Ints]:
+    """Return the rows of each run of two or more that are `kept` (T,)."""
+    rows = np.flatnonzero(kept)
+    return [run for run in np.split(rows, 1 + np.flatnonzero(np.diff(rows) > 1)) if len(run) > 1]
 
 
 def _field(name: str, series: Sequence[Floats]) -> Field:

@@ -22,7 +22,7 @@ from astra_data.dataset.columns import ACTION, GOAL, REWARD, STATE, SUCCESS, TER
 from astra_data.dataset.format import INFO_PATH
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import locate, names_at_home
-from astra_data.io.guessing import HEADING, Field, Logs, Role, csv_files, guess, logs_of
+from astra_data.io.guessing import GAP_STEPS, HEADING, Field, Logs, Role, csv_files, guess, logs_of
 from astra_data.pipeline.first_simulator import DIRECT, SimulatorKind, filled, first_simulator, unpacked
 
 _COLUMNS: dict[Role, str] = {"time": "time", "state": STATE, "command": ACTION, "goal": GOAL}
@@ -101,7 +101,7 @@ def _values(name: str, simulator: SimulatorKind) -> dict[str, str]:
         lines.append(f"| `{called}` | {one.taken_for} | {one.unit} | {one.scale:.4g} | {one.why} |")
     time = [f"time = {_code(field.name)}\ntime_scale = {field.scale!r}\n" for field in logs.of("time")]
     split = [f"field = {_code(field.name)}\n" for field in logs.of("episode")[:1]]
-    split += [f"gap_s = {5 / logs.rate!r}  # a longer step begins a new episode\n"] * len(time)
+    split += [f"gap_s = {GAP_STEPS / logs.rate!r}  # a longer step begins a new episode\n"] * len(time)
     row, command = logs.values(states)[0][:1], logs.values(commands)[0][:1]
     first = simulator.episodes()[0][0][:1]
     given = np.concatenate(logs.values(commands))

@@ -202,7 +202,7 @@ def _failure_blocks(results: Results) -> Iterator[Block]:
         return
     windows = ("AUC 1\N{EN DASH}20 steps", "11\N{EN DASH}30", "21\N{EN DASH}40")
     head = [*_size(results), "predicted by", "failures", *windows, "Brier skill", "observed of predicted"]
-    title = "Failures, predicted on held-out episodes; means over seeds"
+    title = "Failures, predicted on held-out episodes: AUC and skill are means over the seeds, the rest is of all"
     yield TableBlock(title, head, lines, words=1 + results.is_swept)
     yield Text(
         "AUC: the probability that a step this many steps before a failure ranks above a step with no failure in the "

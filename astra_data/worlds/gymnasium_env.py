@@ -145,6 +145,10 @@ class GymnasiumSimulator(NumpySimulator):
 
         def step_each(states: Floats, commands: Floats) -> Floats:
             nonlocal is_checked
+            if env.action_space.shape != commands.shape[1:]:
+                raise BadInputError(
+                    f"{env_id}: expected as many commands as actions, {env.action_space}: got {commands.shape[1]}"
+                )
             landed = np.empty_like(states)
             for row, (state, command) in enumerate(zip(states, commands, strict=True)):
                 write(inner, state)

@@ -89,6 +89,10 @@ class MujocoModel(FreeStates):
     def __init__(
         self, model: "mujoco.MjModel", num_envs: int, *, substeps: int, num_threads: int | None = None
     ) -> None:
+        if not isinstance(model, mujoco.MjModel):
+            raise BadInputError(f"expected a model, such as mujoco.MjModel.from_xml_path(FILE), got {model!r}")
+        if not isinstance(substeps, int) or substeps < 1:
+            raise BadInputError(f"substeps: expected a whole number of 1 or more, got {substeps!r}")
         if model.na:
             raise BadInputError(f"the model has {model.na} actuator states: expected actuators without states")
         # MuJoCo would put a diverging state back to the initial pose, as if the robot had jumped there.
@@ -102,6 +106,8 @@ class MujocoModel(FreeStates):
 
     def step(self, action: Tensor) -> Tensor:
         """Apply controls `action` (B, nu), clipped by the motors; return the new state (B, nq + nv)."""
+        if action.shape[1] != self.model.nu:
+            raise BadInputError(f"expected as many commands as motors, {self.model.nu}: got {action.shape[1]}")
         motion, control = self.state.double().numpy(), action.double().numpy()
         landed = self._steps(self.model, motion, control, substeps=self.substeps)
         self.state = torch.from_numpy(landed).float()

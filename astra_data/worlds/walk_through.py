@@ -14,6 +14,7 @@ from astra_data.worlds.user_code import answered, expect, expect_tensor, explain
 
 _COUNT = 3
 _EVEN, _MOST_UNEVEN = 0.005, 0.1  # relative errors of a rate that `new` takes for whole, and that imports do not refuse
+_MOST_APART = 0.01  # relative, of a simulator's step and the task's
 _TOLERANCE = 1e-4  # between states, relative to their size: simulators compute in single precision
 _log = logging.getLogger(__name__)
 
@@ -124,7 +125,9 @@ def _simulator(task: Task, device: str) -> AbstractSimulator:
     what = f"make_simulator({_COUNT})"
     with explained(what):
         simulator = task.own_simulator(_COUNT, device)
-        state = simulator.state
+        state, taken = simulator.state, simulator.parameters.get("timestep_s", task.timestep_s)
+    if abs(taken / task.timestep_s - 1) > _MOST_APART:
+        raise BadInputError(f"{what}: expected steps of timestep_s, {task.timestep_s:g} s, got steps of {taken:g} s")
     expect(f"{what}.state, {_COUNT} states at once", state, (_COUNT, task.abstract_state.size), torch.float32)
     return simulator
 

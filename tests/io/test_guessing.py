@@ -67,9 +67,9 @@ ROLES: dict[str, tuple[dict[str, object], dict[str, str]]] = {
         {"torque_roll": "state torque_roll N m 1", "thrust": "state thrust N 1"},
     ),
     "positions": (
-        {"east": RAMP, "gps_northing": RAMP, "altitude": RAMP, "angular_x": RAMP, "cmd": RAMP},
+        {"east": RAMP, "gps_northing": RAMP, "altitude": RAMP, "angular_x": RAMP, "body_q_x": RAMP, "rudder": RAMP},
         {"east": "state east m 1", "gps_northing": "state gps_northing m 1", "altitude": "state altitude m 1"}
-        | {"angular_x": "state angular_x 1 1"},
+        | {"angular_x": "state angular_x 1 1", "body_q_x": "state body_q_x 1 1", "rudder": "command rudder 1 1"},
     ),
     "latitude": (
         {"gps_latitude": 60 + RAMP / 1e5, "gps_longitude": RAMP / 1e5, "lat": RAMP, "cmd": RAMP},
@@ -211,6 +211,15 @@ def test_where_the_time_goes_back_an_episode_begins(tmp_path: Path) -> None:
     logs = guess([place])
     assert [len(episode["x"]) for episode in logs.episodes] == [30, 12] and logs.recorded_rate == pytest.approx(20)
     assert logs.of("time")[0].why == "it goes back, where episodes begin (CHECK)"
+
+
+def test_where_rows_are_lacking_an_episode_begins_as_in_an_import(tmp_path: Path) -> None:
+    row = np.arange(40.0)
+    time = row / 10 + 0.35 * (row >= 10) + 0.45 * (row >= 20)  # steps of 4.5 periods, and of 5.5
+    x = np.where(np.isin(row, (30, 32)), np.nan, row)  # a single row is none
+    write(tmp_path / "log.csv", {"t": time, "x": x, "cmd": row % 7}, 40)
+    episodes = [one["x"].tolist() for one in guess([tmp_path]).episodes]
+    assert episodes == [[*range(20)], [*range(20, 30)], [*range(33, 40)]]
 
 
 def test_a_file_of_another_rate_is_named(tmp_path: Path) -> None:

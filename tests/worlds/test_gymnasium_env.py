@@ -185,6 +185,8 @@ def test_what_is_written_has_to_be_what_is_read() -> None:
         simulator.reset_to(torch.tensor([[0.5, 0.5], [1.0, 0.25]]))
         with pytest.raises(BadInputError, match=r"^Pendulum-v1: after write\(.* expected the same"):
             simulator.step(torch.zeros(2, 1))
+    with pytest.raises(BadInputError, match=r"^Pendulum-v1: expected as many commands as actions, Box\(.*: got 2"):
+        make(2, env_id="Pendulum-v1").step(torch.zeros(2, 2))
     reads = []
 
     def noted(env: Env) -> State:

@@ -87,6 +87,16 @@ def test_motors_with_states_of_their_own_are_refused() -> None:
         MujocoModel(mujoco.MjModel.from_xml_string(slow), 1, substeps=1)
 
 
+def test_what_is_no_model_or_no_number_of_steps_or_motors_is_refused(model: mujoco.MjModel) -> None:
+    with pytest.raises(BadInputError, match=r"expected a model, such as .*, got 'robot.xml'"):
+        MujocoModel("robot.xml", 1, substeps=1)  # type: ignore[arg-type]
+    for substeps in (0, 2.5):
+        with pytest.raises(BadInputError, match=f"substeps: expected a whole number of 1 or more, got {substeps}"):
+            MujocoModel(model, 1, substeps=substeps)  # type: ignore[arg-type]
+    with pytest.raises(BadInputError, match="expected as many commands as motors, 1: got 2"):
+        MujocoModel(model, 1, substeps=1).step(torch.zeros(1, 2))
+
+
 def test_a_state_that_diverges_does_not_jump_to_the_initial_pose(model: mujoco.MjModel) -> None:
     simulator = MujocoModel(model, 2, substeps=1)
     simulator.reset_to(torch.tensor([[0.5, 2e10], [0.5, 1.0]]))

@@ -32,6 +32,10 @@ def test_objectives_compute_where_states_are(name: str) -> None:
     assert places(task_named(name)) == {"meta"}
 
 
+def every(timestep_s: float) -> Task:
+    return replace(simulator(parameters={"timestep_s": timestep_s}), timestep_s=timestep_s)
+
+
 @pytest.mark.parametrize(
     ("timestep_s", "told"),
     [
@@ -43,13 +47,13 @@ def test_objectives_compute_where_states_are(name: str) -> None:
     ],
 )
 def test_a_rate_that_is_no_whole_number_is_told(timestep_s: float, told: str, caplog: pytest.LogCaptureFixture) -> None:
-    assert check_task(replace(TASK, timestep_s=timestep_s)) == []
+    assert check_task(every(timestep_s)) == []
     assert (f"task rail-cart: {told}" in caplog.text) if told else not caplog.records
 
 
 @pytest.mark.parametrize(("timestep_s", "way"), [(0.4, "25.0% too long"), (0.65, "23.1% too short")])
 def test_a_rate_that_is_far_from_a_whole_number_is_refused(timestep_s: float, way: str) -> None:
-    (fault,) = check_task(replace(TASK, timestep_s=timestep_s))
+    (fault,) = check_task(every(timestep_s))
     assert fault.startswith(f"timestep_s {timestep_s}: a dataset has a whole number") and way in fault
 
 
@@ -103,6 +107,10 @@ WRONG: list[tuple[Task, str]] = [
     (
         simulator(reset_to=Own.whole),
         "make_simulator: after reset_to(state, rows), state: expected 1 in row 2, entry 0, got 3",
+    ),
+    (
+        simulator(parameters={"timestep_s": 0.014}),
+        "make_simulator(3): expected steps of timestep_s, 0.1 s, got steps of 0.014 s",
     ),
     (simulator(step=Own.lost), "make_simulator: step(command) of shape (3, 1): expected finite numbers, got nan"),
     (simulator(step=Own.stuck), "make_simulator: step(command) fails with ValueError: flat battery"),
