@@ -171,15 +171,15 @@ def guess(paths: Sequence[Path]) -> Logs:
             raise BadInputError(f"{first}: found no {role} among {listed}: name one in the header, such as {example}")
     needed = [field.name for field in fields if field.role in ("time", "state", "command")]
     gaps = {name: gap for name in needed if (gap := sum(int((~np.isfinite(one[name])).sum()) for one in raw))}
-    rows = [np.isfinite([one[name] for name in needed]).all(axis=0) for one in raw]
-    if not any(map(_runs, rows)):
+    runs = [_runs(np.isfinite([one[name] for name in needed])) for one in raw]
+    if not any(runs):
         cut = [field.name for field in fields if field.role == "episode" or field.name in gaps]
         why = f"look at {' and '.join(cut)}, which cut or lack rows" if cut else "record longer"
         raise BadInputError(f"{first}: expected episodes of two rows or more, found none: {why}")
     scaled = [
         {field.name: one[field.name][run] * field.scale + field.offset for field in fields}
-        for one, kept in zip(raw, rows, strict=True)
-        for run in _runs(kept)
+        for one, of in zip(raw, runs, strict=True)
+        for run in of
     ]
     cut_off = [str(source.path) for source, is_torn in zip(sources, torn, strict=True) if is_torn]
     logs = Logs(tuple(fields), tuple(scaled), gaps, tuple(cut_off))
@@ -215,9 +215,9 @@ def _cut(table: dict[str, Floats], begins: Ints) -> list[dict[str, Floats]]:
     return [{name: values[a:b] for name, values in table.items()} for a, b in pairwise(cuts)]
 
 
-def _runs(kept: Bools) -> list[Ints]:
-    """Return the rows of each run of two or more that are `kept` (T,)."""
-    rows = np.flatnonzero(kept)
+def _runs(known: Bools) -> list[Ints]:
+    """Return the rows of each run of two or more in which all values (N, T) are `known`."""
+    rows = np.flatnonzero(known.all(axis=0))
     return [run for run in np.split(rows, 1 + np.flatnonzero(np.diff(rows) > 1)) if len(run) > 1]
 
 

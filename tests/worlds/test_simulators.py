@@ -89,7 +89,7 @@ def test_motors_with_states_of_their_own_are_refused() -> None:
 
 def test_what_is_no_model_or_no_number_of_steps_or_motors_is_refused(model: mujoco.MjModel) -> None:
     with pytest.raises(BadInputError, match=r"expected a model, such as .*, got 'robot.xml'"):
-        MujocoModel("robot.xml", 1, substeps=1)  # type: ignore[arg-type]
+        MujocoModel("robot.xml", 1, substeps=1)
     for substeps in (0, 2.5):
         with pytest.raises(BadInputError, match=f"substeps: expected a whole number of 1 or more, got {substeps}"):
             MujocoModel(model, 1, substeps=substeps)  # type: ignore[arg-type]
