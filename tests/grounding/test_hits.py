@@ -131,7 +131,7 @@ def test_a_ball_that_lies_moves_where_it_is_touched_alone() -> None:
     model, training = puck_model(), pushes()
     model.correction_std.fill_(PUSHED_M / 2)
     optimizer = torch.optim.Adam(model.parameters(), lr=3e-3)
-    for _ in range(300):
+    for _ in range(200):
         loss, parts = model.losses(training.windows, LATENT_ALONE)
         optimizer.zero_grad()
         loss.backward()

@@ -117,7 +117,7 @@ def test_cloning_does_what_was_recorded_whatever_it_paid(
     rightwards = torch.rand(6, STEPS) < 0.25
     episodes.windows.action.copy_(torch.where(rightwards, 0.8, -0.8).unsqueeze(-1).expand(-1, -1, 2))
     episodes.reward.copy_(torch.where(rightwards, 10.0, -10.0))
-    settings: dict[str, Any] = {"critic_updates": 200, "return_steps": 1, "policy_updates": 300}
+    settings: dict[str, Any] = {"critic_updates": 100, "return_steps": 1, "policy_updates": 150}
     settings |= {"learning_rate": 1e-2}
     seen = experience_of(TASK, episodes)
     start = torch.zeros(6, STEPS)

@@ -185,7 +185,7 @@ def test_causal_compass_finds_the_parameters_that_were_planted(tmp_path: Path) -
         sets.append(toy_episodes(states[:, :-1], action, next_state=states[:, 1:]))
     quiet = {"action_noise": (0.0, 0.0), "position_noise_m": (0.0, 2e-3), "velocity_noise_m_s": (0.0, 2e-3)}
     task = replace(ANTS, varied=replace(ANTS.varied, wide=ranges.model_copy(update=quiet)))
-    settings = method.table.model(contexts=64, windows=60, window=15, updates=400, iterations=3)
+    settings = method.table.model(contexts=64, windows=60, window=15, updates=200, iterations=3)
     grounding, figures = method.fit(
         Fitting(task, GroundConfig(), settings, sets[0], sets[1], 0, "cpu", tmp_path, silent)
     )
