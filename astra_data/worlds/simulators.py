@@ -91,15 +91,15 @@ class MujocoModel(FreeStates):
     ) -> None:
         if not isinstance(model, mujoco.MjModel):
             raise BadInputError(f"expected a model, such as mujoco.MjModel.from_xml_path(FILE), got {model!r}")
-        if not isinstance(substeps, int) or substeps < 1:
+        if int(substeps) != substeps or substeps < 1:
             raise BadInputError(f"substeps: expected a whole number of 1 or more, got {substeps!r}")
         if model.na:
             raise BadInputError(f"the model has {model.na} actuator states: expected actuators without states")
         # MuJoCo would put a diverging state back to the initial pose, as if the robot had jumped there.
         self.model = copy.deepcopy(model)
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-        self.substeps = substeps
-        self.parameters = {"timestep_s": substeps * float(model.opt.timestep), "substeps": substeps}
+        self.substeps = int(substeps)
+        self.parameters = {"timestep_s": substeps * float(model.opt.timestep), "substeps": self.substeps}
         self._steps = ColdSteps(self.model, num_envs, num_threads)
         initial = np.concatenate([model.qpos0, np.zeros(model.nv)])
         super().__init__(torch.from_numpy(np.tile(initial, (num_envs, 1))).float())
