@@ -16,7 +16,7 @@ from astra_data.core.provenance import origin
 from astra_data.dataset.format import DATASET_PATH
 from astra_data.methods import grounded_as, method_named
 from astra_data.reports import artifacts, results
-from astra_data.reports.choice import Judgment, Trials, read_judged, read_trials
+from astra_data.reports.choice import Judgment, read_judged, read_trials
 from astra_data.worlds.objective import SUCCESS, Score
 
 DATASET_STAGES = ("collect", "label", "augment", "pair", "subset")  # they write a dataset of each seed
@@ -160,12 +160,15 @@ def read_run(
         if file.dataset_hash:
             version, content = file.dataset_version or "", file.dataset_hash
             uses.append(results.DatasetUse(stage="evaluate", seed=file.seed, version=version, content_hash=content))
-    judgment, trials = None, read_trials(root)
+    judgment = trials = None
     if judged := read_judged(root):
         run.add("select", Owner("", seeds[0], None), judged)
         if known := [one for one in judged.candidates if one.row in rows and one.seed in seeds]:
             facts_of = judged.model_dump(include={"judge", "episodes", "shares_episodes"})
             judgment = Judgment(**facts_of, candidates=known)
+            if begun := read_trials(root):
+                tried = {key for round_ in begun.rounds for key in round_.candidates}
+                trials = begun if tried <= {(one.row, one.seed) for one in known} else None
     run.add("report", Owner("", 0, None), artifacts.Artifact.model_validate(origin()))
     if not files:
         raise MissingStageError(
@@ -198,7 +201,7 @@ def read_run(
         "origins": results.merged_origins(run.origins),
         "user_code": {name: recorded[name] for name in dict.fromkeys(code) if name in recorded},
         "judged": judgment,
-        "trials": Trials.model_validate(trials.model_dump(include=set(Trials.model_fields))) if trials else None,
+        "trials": trials,
         "datasets": [*dict.fromkeys(uses)],
         "lines": run.lines,
         "errors": run.errors,

@@ -176,6 +176,10 @@ def test_a_choice_without_the_target_is_reported_and_stays_published(root: Path,
     assert "| select | 8 s | - |" in page
     manifest = read_manifest(root / "report")
     assert manifest and manifest.made_from["select"] == file_digest(root / "select/select.json")
+    # Trials of what is not reported say nothing there; nor do they fail, where they go on.
+    write_json(root / "select/trials.json", trials)
+    make(root, recipe=FakeRecipe(methods=("astra",)))
+    assert "Trials" not in (root / "report/results.md").read_text()
     shutil.rmtree(root / "select")
     make(root, tmp_path / "results", published=(tmp_path / "results/antmaze_u/results.json",))
     page = (tmp_path / "results/antmaze_u/results.md").read_text()
