@@ -27,7 +27,7 @@ DOCS = sorted(path.relative_to(ROOT / "docs").as_posix().removesuffix(".md") for
 NOTEBOOKS = sorted((ROOT / "docs/guide/notebooks").glob("*.ipynb"))
 COUNTED = {"blockquote", "em", "h2", "h3", "img", "li", "pre", "strong", "td", "tr"}
 SCHEMA: dict[str, Any] = Recipe.model_json_schema()
-TABLES = [name for name in SCHEMA["properties"] if name not in {"plus", "own_methods"}]
+TABLES = [name for name in SCHEMA["properties"] if name not in {"plus", "user_methods"}]
 
 
 @pytest.fixture(scope="module")

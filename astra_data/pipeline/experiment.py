@@ -174,7 +174,7 @@ class Experiment:
         names = {method.table.name: name for name, method in METHODS.items() if method.table}
 
         def compared(settings: Mapping[str, Any]) -> dict[str, Any]:
-            own, data = settings.get("own_methods") or {}, settings.get("data")
+            own, data = settings.get("user_methods") or {}, settings.get("data")
             own = {name: {**table, "method": None} for name, table in own.items() if name in makers}
             asked = {*STAGES} - {"select", "report"} | {name for name, of in names.items() if of in makers}
             tables = {name: table for name, table in settings.items() if name in asked}

@@ -82,7 +82,7 @@ def _world(
     run: str | Path, settings: dict[str, Any], row: str, seed: int, percent: int | None, **options: Any
 ) -> tuple[SimulatorEnv, Simulation, Training]:
     """Return the environment that `train` builds for a row, and what it builds it from."""
-    add_all(settings.get("own_methods", {}))
+    add_all(settings.get("user_methods", {}))
     learn = method_named(row).learn
     if not isinstance(learn, InSimulator):
         expected = "expected a row that is, such as nas, or direct_transfer for the raw simulator"

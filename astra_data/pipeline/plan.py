@@ -183,7 +183,7 @@ class _Plan:
     def _settings(self, stage: Stage, name: str, given: Mapping[str, Any]) -> dict[str, JsonValue]:
         """Return what an artifact is made with, as JSON: settings, and digests of the user's code by files."""
         recipe, method = self.recipe, base_method(name)
-        names = {"task": recipe.task} | {own: given.method for own, given in recipe.own_methods.items()}
+        names = {"task": recipe.task} | {own: given.method for own, given in recipe.user_methods.items()}
         used = {"task": {"task", "simulator"} & given.keys(), method: method in names}
         code = {
             Path(names[one].rpartition(":")[0]).name: self._digests[one]
@@ -206,7 +206,7 @@ class _Plan:
 
     @cached_property
     def _digests(self) -> dict[str, str]:
-        return digests_of(self.recipe.task, self.recipe.own_methods)
+        return digests_of(self.recipe.task, self.recipe.user_methods)
 
     def _artifacts(self, stage: Stage, seed: int, percent: int | None, name: str) -> dict[str, str | None]:
         """Return the keys of the artifacts that a stage may read, by its parameters."""

@@ -60,7 +60,7 @@ class _Record(BaseModel, extra="allow"):
     """What is read of a record before it is known to be a recipe of today."""
 
     task: str
-    own_methods: dict[str, UserMethod] = {}
+    user_methods: dict[str, UserMethod] = {}
     sweep: dict[str, JsonValue] = {}
 
 
@@ -81,8 +81,8 @@ def read_tables(path: Path) -> dict[str, Any]:
     task, data = tables.get("task"), tables.get("data")
     if isinstance(task, str):
         tables["task"] = place_beside(task, path.parent)
-    if isinstance(own := tables.get("own_methods"), dict):
-        tables["own_methods"] = looked_up(own, path.parent)
+    if isinstance(own := tables.get("user_methods"), dict):
+        tables["user_methods"] = looked_up(own, path.parent)
     if isinstance(data, str) and (path.parent / data / INFO_PATH).is_file():
         tables["data"] = str(path.parent / data)
     return tables
@@ -124,7 +124,7 @@ class Recipe(Config):
     data: str | None = None
     """A dataset instead of `[collect]`: a folder next to the recipe, what dataset commands take (a folder, a
     name in the home folder, "walks@data-1.0.0"), or what `pull` takes ("user/name", "s3://…")."""
-    own_methods: dict[str, UserMethod] = Field(default_factory=dict)
+    user_methods: dict[str, UserMethod] = Field(default_factory=dict)
     """Your own methods, by the names of their rows: "delta.py:METHOD", or a table of that and settings."""
     methods: tuple[str, ...] = Field(min_length=1)
     """Rows of the results: a name in `astra_data.methods.METHODS`, alone or followed by `_plus`."""
@@ -146,7 +146,7 @@ class Recipe(Config):
         method = METHODS[name]
         if method.table is None or method.configures != stage:
             return None
-        own = self.own_methods.get(name)
+        own = self.user_methods.get(name)
         return own.settings(name) if own else getattr(self, method.table.name)
 
     def config_of(self, stage: str) -> Config | None:
@@ -175,17 +175,17 @@ class Recipe(Config):
             task_named(task)
         return task
 
-    @field_validator("own_methods")
+    @field_validator("user_methods")
     @classmethod
-    def _add_own_methods(cls, methods: dict[str, UserMethod]) -> dict[str, UserMethod]:
+    def _add_user_methods(cls, methods: dict[str, UserMethod]) -> dict[str, UserMethod]:
         with as_fault():
             add_all(methods)
         return methods
 
     @field_validator("methods")
     @classmethod
-    def _are_known_methods(cls, rows: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
-        if "own_methods" not in info.data:
+    def _are_knuser_methods(cls, rows: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
+        if "user_methods" not in info.data:
             return rows  # told already
         for row in rows:
             with as_fault():

@@ -235,7 +235,7 @@ def make(
         for key, reason in again.items():
             show(f"{key} is recreated: {reason}; the old one is in {set_aside(folder, key)}")
         write_file(folder / RECORD, recipe.model_dump_json(indent=2) + "\n")
-        if digests := digests_of(recipe.task, recipe.own_methods):
+        if digests := digests_of(recipe.task, recipe.user_methods):
             write_file(folder / CODE, json.dumps(recorded_code(folder) | digests, indent=1) + "\n")
         experiment.write_made_with(items)
         points = points or {}
@@ -254,16 +254,16 @@ def make(
                 jobs=jobs,
                 logs=folder / "logs",
                 watch=watch,
-                prepare=partial(_prepare, dict(recipe.own_methods)),
+                prepare=partial(_prepare, dict(recipe.user_methods)),
                 address=address,
             )
 
 
-def _prepare(own_methods: dict[str, UserMethod]) -> None:
+def _prepare(user_methods: dict[str, UserMethod]) -> None:
     """Make a process ready for an item of a recipe with these methods of its own."""
     # One thread for the networks: they are small, and idle threads would slow down other items.
     torch.set_num_threads(1)
-    add_all(own_methods)
+    add_all(user_methods)
 
 
 def _check_inputs(experiment: Experiment, items: Collection[Item], planned: Collection[Item]) -> None:

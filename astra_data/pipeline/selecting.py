@@ -53,7 +53,7 @@ def asked_of(
 ) -> tuple[Reported, SelectConfig]:
     """Return what is judged of a run, and how; without `rows` all, and as its recipe says."""
     folder, settings = Path(run), settings_of(run)
-    add_all(settings.get("own_methods", {}))
+    add_all(settings.get("user_methods", {}))
     asked = (settings.get("select") or {}) | only_given(judge=judge, episodes=episodes)
     config = validated(asked, SelectConfig, f"{folder}: select")
     recipe = Reported(

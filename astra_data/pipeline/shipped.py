@@ -73,7 +73,9 @@ class ShippedRecipe:
     def files(self) -> set[Path]:
         """The files that it needs, below `RECIPES`: its base, code, and what its head names."""
         folders = [RECIPES / self.path.parent]
-        methods = (own if isinstance(own, str) else own["method"] for own in self.table.get("own_methods", {}).values())
+        methods = (
+            own if isinstance(own, str) else own["method"] for own in self.table.get("user_methods", {}).values()
+        )
         for code in (str(self.table.get("task", "")), *methods):
             place = folders[0] / code.partition(":")[0]
             folders += [place.resolve().parent] if place.is_file() else []

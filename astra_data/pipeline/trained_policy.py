@@ -98,14 +98,14 @@ def settings_of(run: str | Path) -> dict[str, Any]:
     settings = recorded_settings(folder)
     settings["task"] = found_near(settings["task"], folder)
     check_unchanged(settings["task"], folder)
-    for own in settings.get("own_methods", {}).values():
+    for own in settings.get("user_methods", {}).values():
         own["method"] = found_near(own["method"], folder)
     return settings
 
 
 def _files(settings: dict[str, Any], folder: Path, row: str, seed: int, percent: int | None) -> dict[str, Path]:
-    own_methods = settings.get("own_methods", {})
-    add_all(own_methods)
+    user_methods = settings.get("user_methods", {})
+    add_all(user_methods)
     files = {"train": folder / artifact_key("train", row, seed, percent) / POLICY}
     rows, seeds = settings.get("methods", [row]), settings.get("seeds", [seed])
     if not files["train"].is_file() and row not in rows:
@@ -119,8 +119,8 @@ def _files(settings: dict[str, Any], folder: Path, row: str, seed: int, percent:
     if percent not in (sizes or (None,)):
         wanted = f"one of {', '.join(map(str, sizes))}" if sizes else "none, as the recipe has one size"
         raise BadInputError(f"{folder}: percent: expected {wanted}, got {percent or 'none'}")
-    for name in own_methods.keys() & {method.name, base}:
-        check_unchanged(own_methods[name]["method"], folder, name=name)
+    for name in user_methods.keys() & {method.name, base}:
+        check_unchanged(user_methods[name]["method"], folder, name=name)
     if method.grounds:
         files["ground"] = folder / artifact_key("ground", base, seed, percent) / GROUNDING
     is_read = (settings.get("align") or {}).get("inputs") or (settings.get("evaluate") or {}).get("encoder") != "source"

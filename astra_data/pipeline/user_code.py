@@ -37,18 +37,18 @@ class UserMethod(Config, extra="allow"):
             raise BadInputError(str(error)) from None
 
 
-def add_all(own_methods: Mapping[str, Any]) -> None:
+def add_all(user_methods: Mapping[str, Any]) -> None:
     """Add the methods of a recipe, each as the recipe names it, and check their settings."""
-    for name, given in own_methods.items():
+    for name, given in user_methods.items():
         own = UserMethod.model_validate(given)
         add_method(name, own.method)
         own.settings(name)
 
 
-def looked_up(own_methods: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+def looked_up(user_methods: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """Return the methods of a recipe in `folder`, their files looked up there; what is no table is left."""
     found = {}
-    for name, given in own_methods.items():
+    for name, given in user_methods.items():
         table = {"method": given} if isinstance(given, str) else given
         if isinstance(table, dict) and isinstance(table.get("method"), str):
             table = table | {"method": place_beside(table["method"], folder)}
@@ -57,8 +57,8 @@ def looked_up(own_methods: Mapping[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def with_offered(tables: Mapping[str, Any], keys: Collection[str]) -> dict[str, Any]:
-    """Return the `tables` of a recipe with the methods that installed packages offer among `own_methods`."""
-    rows, own = tables.get("methods", ()), tables.get("own_methods", {})
+    """Return the `tables` of a recipe with the methods that installed packages offer among `user_methods`."""
+    rows, own = tables.get("methods", ()), tables.get("user_methods", {})
     if not isinstance(rows, list | tuple) or not isinstance(own, Mapping):
         return dict(tables)
     names = {base_method(row) for row in rows if isinstance(row, str)} | {*tables}
@@ -67,7 +67,7 @@ def with_offered(tables: Mapping[str, Any], keys: Collection[str]) -> dict[str, 
     given = {name: table for name in found if isinstance(table := tables.get(name, {}), dict)}
     taken = {name: table | {"method": found[name]} for name, table in given.items()}
     rest = {key: value for key, value in tables.items() if key not in taken}
-    return rest | {"own_methods": {**own, **taken}} if taken else rest
+    return rest | {"user_methods": {**own, **taken}} if taken else rest
 
 
 def check_unchanged(place: str, run: Path, *, name: str = "task") -> None:
@@ -81,8 +81,8 @@ def check_unchanged(place: str, run: Path, *, name: str = "task") -> None:
         )
 
 
-def digests_of(task: str, own_methods: Mapping[str, UserMethod]) -> dict[str, str]:
+def digests_of(task: str, user_methods: Mapping[str, UserMethod]) -> dict[str, str]:
     """Return the digest of the code of "task", and of methods by their names, where it is the user's."""
-    places = {"task": place_of(task)} | {name: own.method for name, own in own_methods.items()}
+    places = {"task": place_of(task)} | {name: own.method for name, own in user_methods.items()}
     found = {name: code_digest(place) for name, place in places.items()}
     return {name: digest for name, digest in found.items() if digest}

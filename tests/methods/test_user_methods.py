@@ -36,7 +36,7 @@ SMALL = RAIL.replace('max_steps = 40\nstart = "task"', "max_steps = 12")
 def recipe(folder: Path, methods: str, own: str) -> Path:
     path = folder / "own.toml"
     path.write_text(
-        f'task = "{ROOT}/tests/small_cart.py:TASK"\nmethods = {methods}\nseeds = [0]\n[own_methods]\n{own}{SMALL}'
+        f'task = "{ROOT}/tests/small_cart.py:TASK"\nmethods = {methods}\nseeds = [0]\n[user_methods]\n{own}{SMALL}'
     )
     return path
 
@@ -231,7 +231,7 @@ def test_they_are_rows_from_the_recipe_to_the_page(tmp_path: Path) -> None:
         (
             "delta_action",
             "memroy = 4",
-            "own.toml: own_methods: delta_action: memroy: unknown key: did you mean 'memory'",
+            "own.toml: user_methods: delta_action: memroy: unknown key: did you mean 'memory'",
         ),
         ("delta_action", "memory = 0", "memory: expected greater than or equal to 1, got 0"),
         ("gru_ensemble", "members = 3", "gru_ensemble.py:METHOD has no settings, got members"),

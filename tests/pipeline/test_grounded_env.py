@@ -114,7 +114,7 @@ def test_methods_of_the_run_s_own_are_added_when_it_is_opened(
     """A fresh process knows none of them."""
     (tmp_path / "mine.py").write_text("from astra_data.methods import METHODS\nMETHOD = METHODS['direct_transfer']\n")
     own = {"mine": f"{tmp_path}/mine.py:METHOD"}
-    settings = settings_of(run) | {"own_methods": own, "methods": ["direct_transfer", "mine"]}
+    settings = settings_of(run) | {"user_methods": own, "methods": ["direct_transfer", "mine"]}
     monkeypatch.setattr(grounded_env, "settings_of", lambda _: settings)
     mine, raw = (gymnasium.make(ID, run=run, row=row) for row in ("mine", "direct_transfer"))
     np.testing.assert_array_equal(mine.reset(seed=3)[0], raw.reset(seed=3)[0])

@@ -103,8 +103,8 @@ def test_what_does_not_fit_the_learner_is_told_in_a_line(tables: dict[str, Any],
 
 
 def test_a_method_of_ones_own_that_is_not_there_is_told_once() -> None:
-    with pytest.raises(RecipeError, match=r"own_methods: .*nothing\.py") as caught:
-        read(own_methods={"mine": "nothing.py:METHOD"}, methods=["mine"])
+    with pytest.raises(RecipeError, match=r"user_methods: .*nothing\.py") as caught:
+        read(user_methods={"mine": "nothing.py:METHOD"}, methods=["mine"])
     assert "unknown method" not in str(caught.value)
 
 
@@ -143,7 +143,7 @@ def test_a_mapping_in_place_of_a_recipe_is_told() -> None:
 
 
 def test_what_a_run_recorded_is_read_with_keys_of_any_age(tmp_path: Path) -> None:
-    recorded = {"task": "a", "own_methods": {"mine": {"method": "m.py:M", "rate": 0.5}}, "gone": [1, None]}
+    recorded = {"task": "a", "user_methods": {"mine": {"method": "m.py:M", "rate": 0.5}}, "gone": [1, None]}
     (tmp_path / "recipe.json").write_text(json.dumps(recorded))
     assert recorded_settings(tmp_path) == recorded
 
@@ -157,7 +157,7 @@ def test_what_a_run_recorded_is_read_with_keys_of_any_age(tmp_path: Path) -> Non
         ("{}", "task: Field required"),
         ('{"task": 3}', "task: "),
         ('{"task": "a", "sweep": []}', "sweep: "),
-        ('{"task": "a", "own_methods": {"mine": {}}}', "own_methods.mine.method: Field required"),
+        ('{"task": "a", "user_methods": {"mine": {}}}', "user_methods.mine.method: Field required"),
     ],
 )
 def test_a_damaged_record_is_told(text: str, fault: str, tmp_path: Path) -> None:

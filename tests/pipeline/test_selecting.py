@@ -107,6 +107,6 @@ def test_policies_of_every_size_are_judged(folder: Path, monkeypatch: pytest.Mon
 @pytest.mark.usefixtures("forgotten_methods")
 def test_rows_are_judged_with_the_groundings_that_they_share(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ensemble = f"{Path(__file__).parents[2]}/recipes/examples/methods/gru_ensemble.py:METHOD"
-    changes = {"methods": ["nas_plus", "mine"], "own_methods": {"mine": {"method": ensemble}}}
+    changes = {"methods": ["nas_plus", "mine"], "user_methods": {"mine": {"method": ensemble}}}
     rows = asked(folder, monkeypatch, changes).methods
     assert {row: grounded_as(row) for row in rows} == {"nas_plus": "nas", "mine": "mine"}

@@ -59,20 +59,20 @@ def test_files_of_the_users_are_found_from_everywhere(tmp_path: Path, monkeypatc
     run = tmp_path / "runs/cart"
     run.mkdir(parents=True)
     own = {"damped": {"method": "damped.py:METHOD", "gain": 2.0}}
-    (run / "recipe.json").write_text(json.dumps({"task": "cart.py:TASK", "own_methods": own}))
+    (run / "recipe.json").write_text(json.dumps({"task": "cart.py:TASK", "user_methods": own}))
     for name in ("cart.py", "damped.py"):
         (tmp_path / name).touch()
     monkeypatch.chdir(run)
     found = settings_of(run)
     assert found["task"] == f"{tmp_path}/cart.py:TASK"
-    assert found["own_methods"] == {"damped": {"method": f"{tmp_path}/damped.py:METHOD", "gain": 2.0}}
+    assert found["user_methods"] == {"damped": {"method": f"{tmp_path}/damped.py:METHOD", "gain": 2.0}}
 
 
 def test_a_file_of_the_same_name_here_is_not_that_of_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run, elsewhere = tmp_path / "cart/runs/cart", tmp_path / "elsewhere"
     for folder in (run, elsewhere):
         folder.mkdir(parents=True)
-    settings = {"task": "cart.py:TASK", "own_methods": {"damped": {"method": "damped.py:METHOD"}}}
+    settings = {"task": "cart.py:TASK", "user_methods": {"damped": {"method": "damped.py:METHOD"}}}
     (run / "recipe.json").write_text(json.dumps(settings))
     for folder in (tmp_path / "cart", elsewhere):
         for name in ("cart.py", "damped.py"):
@@ -81,7 +81,7 @@ def test_a_file_of_the_same_name_here_is_not_that_of_a_run(tmp_path: Path, monke
     monkeypatch.chdir(elsewhere)
     found = settings_of("../cart/runs/cart")
     assert found["task"] == f"{tmp_path}/cart/cart.py:TASK"
-    assert found["own_methods"]["damped"]["method"] == f"{tmp_path}/cart/damped.py:METHOD"
+    assert found["user_methods"]["damped"]["method"] == f"{tmp_path}/cart/damped.py:METHOD"
     # With none but the wrong one, that is told by its place.
     (tmp_path / "cart/cart.py").unlink()
     with pytest.raises(BadInputError, match=r"^cart\.py changed since \.\./cart/runs/cart was made"):

@@ -26,7 +26,7 @@ task = "rail.py:TASK"
 methods = ["nas", "mine"]
 seeds = [0]
 
-[own_methods]
+[user_methods]
 mine = "mine.py:METHOD"
 
 [collect]
@@ -60,7 +60,7 @@ def edit(file: Path, old: str, new: str) -> None:
 def test_comments_and_methods_that_come_and_go_outdate_nothing(made: Path) -> None:
     edit(made / "rail.py", "class Rail:", "# On a rail.\n\nclass Rail:")
     whole = (made / "rail.toml").read_text()
-    edit(made / "rail.toml", '[own_methods]\nmine = "mine.py:METHOD"\n', "")
+    edit(made / "rail.toml", '[user_methods]\nmine = "mine.py:METHOD"\n', "")
     edit(made / "rail.toml", '["nas", "mine"]', '["nas"]')
     assert outdated(made) == {}
     run(made / "rail.toml", root=made / "runs")

@@ -52,21 +52,21 @@ def test_those_that_packages_offer_are_named_as_if_the_recipe_gave_their_places(
 ) -> None:
     offered = {"theirs": "their.module:METHOD", "unused": "no.module:METHOD", "nas": "no.module:METHOD"}
     monkeypatch.setattr("astra_data.methods.offered", lambda _: offered)
-    tables = {"methods": ["nas", "theirs_plus"], "theirs": {"memory": 5}, "own_methods": {"mine": DELTA}}
-    assert with_offered(tables, ("methods", "own_methods")) == {
+    tables = {"methods": ["nas", "theirs_plus"], "theirs": {"memory": 5}, "user_methods": {"mine": DELTA}}
+    assert with_offered(tables, ("methods", "user_methods")) == {
         "methods": ["nas", "theirs_plus"],
-        "own_methods": {"mine": DELTA, "theirs": {"memory": 5, "method": "their.module:METHOD"}},
+        "user_methods": {"mine": DELTA, "theirs": {"memory": 5, "method": "their.module:METHOD"}},
     }
     for as_it_is in ({"methods": ["nas"], "mine": {}}, {"methods": "theirs"}, {"theirs": 5}):
-        assert with_offered(as_it_is, ("methods", "own_methods")) == as_it_is
-    given = {"methods": ["theirs"], "own_methods": {"theirs": DELTA}}
-    assert with_offered(given, ("methods", "own_methods")) == given
+        assert with_offered(as_it_is, ("methods", "user_methods")) == as_it_is
+    given = {"methods": ["theirs"], "user_methods": {"theirs": DELTA}}
+    assert with_offered(given, ("methods", "user_methods")) == given
 
 
 OWN = """task = "antmaze-umaze"
 methods = ["delta", "nas"]
 seeds = [0]
-[own_methods]
+[user_methods]
 delta = {{ method = "{place}", memory = {memory} }}
 """
 
@@ -78,7 +78,7 @@ def test_a_recipe_that_changes_their_settings_borrows_nothing_made_with_those_of
         other.write_text(f'based_on = "base"\n{OWN.format(place=DELTA, memory=memory)}')
         assert load_experiment(other, tmp_path).borrowed == (borrowed or {"collect", "pair"})
     # Another method that the base does not know of changes nothing of it.
-    other.write_text(f'based_on = "base"\n[own_methods]\nplain = "{ENSEMBLE}"\n')
+    other.write_text(f'based_on = "base"\n[user_methods]\nplain = "{ENSEMBLE}"\n')
     assert "ground" in load_experiment(other, tmp_path).borrowed
     # That its default is written out is no change.
     (tmp_path / "base.toml").write_text(OWN.format(place=DELTA, memory=32).replace(", memory = 32", ""))
@@ -104,7 +104,7 @@ def test_results_that_were_published_with_other_settings_of_theirs_are_not_the_r
     recipe.write_text(OWN.format(place=DELTA, memory=8))
     with pytest.raises(RecipeError, match=r"^delta \(memory: 32, now 8\) changed in .* since the results"):
         load_experiment(recipe, tmp_path).published()
-    other = {"own_methods": {"delta": {"method": DELTA, "no_setting": 3}}}
+    other = {"user_methods": {"delta": {"method": DELTA, "no_setting": 3}}}
     published(**other)
     with pytest.raises(RecipeError, match=r"^delta \(.*no_setting: 3, now none"):
         load_experiment(recipe, tmp_path).published()

@@ -39,8 +39,8 @@ def recipe_keys() -> str:
 
 
 def _section(name: str, models: list[type[BaseModel]]) -> str:
-    if name == "own_methods":
-        return _titled("own_methods.NAME", models[0], _key_table(models[0].model_fields))
+    if name == "user_methods":
+        return _titled("user_methods.NAME", models[0], _key_table(models[0].model_fields))
     if name == "plus":
         return (
             "## `[plus]`\n\nThe training of rows with `_plus`: the keys of [`[train]`](#train), laid "

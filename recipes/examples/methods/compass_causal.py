@@ -119,7 +119,7 @@ def beginnings(episodes, length):
     steps = torch.arange(episodes.windows.mask.shape[1], device=episodes.lengths.device)
     found = (steps <= (episodes.lengths - length)[:, None]).nonzero()
     if not len(found):
-        raise BadInputError(f"no episode has {length} steps: shorten window in [own_methods.compass_causal]")
+        raise BadInputError(f"no episode has {length} steps: shorten window in [user_methods.compass_causal]")
     return found.unbind(1)
 
 

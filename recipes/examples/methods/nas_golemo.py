@@ -132,7 +132,7 @@ def fit(fitting):
             missed = float(loss_of(held_out, held_out.mask.bool()))
         fitting.progress((epoch + 1) / config.epochs, f"held-out loss {missed:.3f}")
     if not torch.isfinite(torch.tensor(missed)):
-        raise BadInputError("the fit diverged: lower learning_rate in [own_methods.nas_golemo]")
+        raise BadInputError("the fit diverged: lower learning_rate in [user_methods.nas_golemo]")
     return ResidualGrounding(model.requires_grad_(False)), {"loss": missed}
 
 
