@@ -225,11 +225,12 @@ def episodes(
 
     What is wrong with files and episodes is added to `left_out`, and they are; without it, they are refused.
     """
-    recording, size = None, 0
+    recording, size, lost = None, 0, 0
     try:
         for number, source in enumerate(sources):
             source = replace(source, faults=left_out)
-            is_apart = mapping.split.files or source.recording != recording
+            is_apart = mapping.split.files or source.recording != recording or lost < len(left_out or ())
+            lost = len(left_out or ())
             try:
                 for block in _blocks(source, module, mapping):
                     size += VALUE_BYTES * sum(values.size for values in block.values.values())

@@ -51,6 +51,11 @@ def test_bad_files_are_left_out_where_that_is_asked_for_and_told(tmp_path: Path)
     assert Dataset.open(report.root).description["left_out"] == list(report.left_out)
     names = [one["name"] for one in dataset.description["config"]["recordings"]]
     assert names == [path.name for path in paths]
+    one_log = MAPPING.replace('[columns."next.terminated"]\nfields = ["fell"]\n', "").replace(
+        'field = "trial"', "files = false"
+    )
+    joined, _ = imported(tmp_path / "joined", tmp_path, one_log, skip_bad=True)
+    assert joined.lengths.tolist() == [19, 19]  # no step leads from the first file to the last
 
 
 def test_an_episode_that_is_bad_is_left_out_and_its_file_is_not(tmp_path: Path) -> None:
