@@ -102,7 +102,7 @@ def test_an_ancestor_is_known_by_its_hash(tmp_path: Path) -> None:
 
 
 def test_copies_are_counted_as_the_recording_that_they_are_of(tmp_path: Path) -> None:
-    sources = {3: None, 8: 3, 5: 3, 9: 7, 7: None}
+    sources = {3: None, 8: 3, 5: 8, 9: 7, 7: None}  # 5 is a copy of a part of 3
     columns = fake_episode(0, 3).columns
     with writer(tmp_path / "set") as open_writer:
         for uid, source in sources.items():
