@@ -181,7 +181,7 @@ def _resampled(episode: Episode, turns: Sequence[tuple[Column, _Turns]], before:
     row = np.minimum((times_s * before + 1e-6).astype(int), len(episode))
     columns: dict[str, Array] = {}
     for column, angles in turns:
-        values = episode.columns[column.name]
+        values, is_next = episode.columns[column.name], column.name.startswith("next.")
         if column.name == names.REWARD:
             sums = np.concatenate([[0.0], np.cumsum(values, dtype=np.float64)])
             found = np.diff(sums[[*row[:-1], len(episode)]])
@@ -196,11 +196,11 @@ def _resampled(episode: Episode, turns: Sequence[tuple[Column, _Turns]], before:
                 of = np.concatenate([of, episode.columns[names.NEXT_STATE][-1:]])
             elif is_clock(column):
                 of = np.concatenate([of, 2 * of[-1:] - of[-2:-1]]) if len(of) > 1 else of
-            at = times_s[1:] if column.name == names.NEXT_STATE else times_s[:-1]
-            found = _interpolated(as_rows(of).astype(np.float64), at * before, column, angles)
+            at = times_s[is_next : steps + is_next] * before - (is_next and column.name != names.NEXT_STATE)
+            found = _interpolated(as_rows(of).astype(np.float64), at, column, angles)
             found = found.reshape(steps, *values.shape[1:])
         else:
-            found = values[np.minimum(row[:-1], len(episode) - 1)]
+            found = values[np.minimum(np.maximum(row[:-1], row[1:] - 1) if is_next else row[:-1], len(episode) - 1)]
         columns[column.name] = found.astype(values.dtype)
     cameras = {name: clip.part(0, steps * (before // fps), before // fps) for name, clip in episode.cameras.items()}
     return replace(episode, columns=columns, metadata=_facts(columns, episode.metadata), cameras=cameras)

@@ -161,10 +161,13 @@ def test_rewards_and_endings_are_those_of_all_steps_within(tmp_path: Path) -> No
 
 
 def test_without_next_states_the_last_state_has_no_step_after_it(tmp_path: Path) -> None:
-    with writer(tmp_path / "logs", columns=[Column(STATE)], fps=10) as open_writer:
-        open_writer.add(Episode(0, {STATE: np.arange(6, dtype=np.float32)}))
+    after = ("next.observation.load", "next.mode")  # what is next is after the longer step
+    with writer(tmp_path / "logs", columns=[Column(STATE), *map(Column, after)], fps=10) as open_writer:
+        time = np.arange(6, dtype=np.float32)
+        open_writer.add(Episode(0, {STATE: time} | dict.fromkeys(after, time + 1)))
     (episode,) = made(resample(Dataset.open(tmp_path / "logs"), 5, out=tmp_path / "out"))
     assert episode.columns[STATE].tolist() == [0, 2, 4]
+    assert [episode.columns[name].tolist() for name in after] == [[2, 4, 6]] * 2
 
 
 def test_angles_that_are_counted_go_on(tmp_path: Path) -> None:
