@@ -101,9 +101,9 @@ def diagnose(dataset: str | Path, simulator: str, progress: Progress = silent) -
     responses = _responses(log, felt, names, source.info["fps"])
     missed = _missed(log, pairing)
     recordings, known = len(np.unique(log.recording)), _Error.of(log, felt)
-    may_explain = known.error.size and recordings > 1
-    explained, shown = _explained(log, known, labels[keys.STATE]) if may_explain else ({}, [])
-    forecast = _forecast(known) if known.error.size and recordings >= FEWEST else None
+    long_enough = int(known.recording.max()) + 1 if known.error.size else 0
+    explained, shown = _explained(log, known, labels[keys.STATE]) if long_enough > 1 else ({}, [])
+    forecast = _forecast(known) if long_enough >= FEWEST else None
     findings = (
         *_of_responses(responses, source.info["fps"]),
         *_of_hidden_state([*explained.values()], shown),

@@ -1,6 +1,7 @@
 """A robot that follows its commands late, in what is known of it."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 
 from astra_data.core.arrays import Floats
 from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE, Column, Episode
+from astra_data.dataset.reader import Dataset
 from astra_data.dataset.writer import DatasetWriter
 from astra_data.grounding import diagnosis
 from astra_data.pipeline.stages.pair import pair
@@ -33,6 +35,8 @@ class Axes:
         return self.state
 '''
 
+ABOUT = {"name": "logs", "stage": "import"}
+
 
 def recorded(
     folder: Path,
@@ -54,8 +58,7 @@ def recorded(
     rng, follows = np.random.default_rng(0), 1.0 if not lag_s else 1 - np.exp(-0.1 / lag_s)
     columns = [Column(STATE, size=5, names=("x", "y", "vx", "vy", "current")), Column(NEXT_STATE, size=5)]
     columns += [Column(ACTION, size=2, names=("pull", "push"))]
-    about = {"name": "logs", "stage": "import"}
-    with DatasetWriter(folder / "logs", columns, fps=10, task="rail", description=about) as writer:
+    with DatasetWriter(folder / "logs", columns, fps=10, task="rail", description=ABOUT) as writer:
         for number in range(12):
             command = rng.uniform(-1.0, 1.0, (170, 2)).repeat(rng.integers(1, 6, 170), axis=0)[:170]
             if same:
@@ -151,6 +154,20 @@ def test_how_far_it_is_is_told(tmp_path: Path) -> None:
     steps = 12 * (150 - lags)
     expected = [(lag / (lags + 1), f"{steps * (1 + 2 * lag):,} steps of the simulator") for lag in range(lags + 1)]
     assert lags > 1 and notes == expected
+
+
+def test_recordings_that_are_too_short_count_for_no_forecast(tmp_path: Path) -> None:
+    """Eleven falls, and a drive with its copies."""
+    recorded(tmp_path)
+    logs, simulator = Dataset.open(tmp_path / "logs"), f"{tmp_path / 'axes.py'}:Axes"
+    drive, *others = logs.episodes()
+    with DatasetWriter(tmp_path / "few", logs.schema, fps=10, task="rail", description=ABOUT) as writer:
+        for fall in others:
+            writer.add(replace(fall, columns={name: values[:6] for name, values in fall.columns.items()}))
+        for uid in range(100, 114):
+            writer.add(replace(drive, uid=uid, metadata={"source_episode": 0}))
+    found = diagnosis.diagnose(pair(simulator, dataset=tmp_path / "few", out=tmp_path / "few_pairs"), simulator)
+    assert found.recordings == 12 and not found.forecast and not found.explained
 
 
 def test_commands_that_only_vary_together_are_warned_of(tmp_path: Path) -> None:
