@@ -79,7 +79,7 @@ def ground(
         gap = gap_report(world, written, held_out, seed=seed)
         progress(1.0, _derived(figures))
         spent = stopwatch.spent()
-        figures |= {clock: figures[clock] + spent[clock] - fit_end[clock] for clock in CLOCKS}
+        figures |= spent | {clock: figures[clock] + spent[clock] - fit_end[clock] for clock in CLOCKS}
         (folder / METRICS).write_text(json.dumps(figures, indent=1))
         (folder / GAP).write_text(json.dumps(gap, indent=1))
 

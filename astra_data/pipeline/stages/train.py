@@ -102,7 +102,9 @@ def train(
         policy.save(folder / POLICY)
         if policy.simulation is not None:
             curve["world"] = policy.simulation.world.model_dump()
-        (folder / CURVE).write_text(json.dumps(made | stopwatch.spent() | curve, indent=1))
+        spent = stopwatch.spent()
+        figures = made | spent | curve | {"finished_at": spent["finished_at"]}  # of the last part, whichever is kept
+        (folder / CURVE).write_text(json.dumps(figures, indent=1))
 
 
 def _learned(learn: Learn, training: Training) -> tuple[PolicyFile, dict[str, Any]]:

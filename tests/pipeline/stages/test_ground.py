@@ -115,8 +115,10 @@ def test_the_time_is_that_of_the_whole_stage(
 
         monkeypatch.setattr(place, slow)
     monkeypatch.setattr("astra_data.core.progress.time.perf_counter", lambda: late[0] + 1e-6 * next(ticks))
+    monkeypatch.setattr("astra_data.core.progress.time.time", lambda: late[0])
     make(task, paired, tmp_path / "grounded")
-    assert json.loads((tmp_path / "grounded/metrics.json").read_text())["wall_seconds"] == pytest.approx(7200.0, abs=1)
+    told = json.loads((tmp_path / "grounded/metrics.json").read_text())
+    assert told["wall_seconds"] == pytest.approx(7200.0, abs=1) and told["finished_at"] == 7200.0
 
 
 @pytest.mark.parametrize(

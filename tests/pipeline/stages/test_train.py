@@ -114,6 +114,7 @@ def test_rma_deploys_a_student_that_is_told_no_parameters(task: str, paired: Pat
     curve = json.loads((tmp_path / "train" / "curve.json").read_text())
     assert [point["steps"] for point in curve["points"]] == [64 * (index + 1) for index in range(6)]
     adaptation = curve["adaptation"]["points"]
+    assert curve["finished_at"] >= curve["adaptation"]["finished_at"]
     assert [point["steps"] for point in adaptation] == [64 * (index + 1) for index in range(4)]
     figures = {"steps", "share", "success", "episode_steps", "episodes", "reward", "r2_extrinsics"}
     assert adaptation[0].keys() == figures
