@@ -61,7 +61,7 @@ def trim(
 
     def kept(episode: Episode) -> Bools:
         left = np.zeros(len(episode), bool)
-        left[first : len(episode) - last] = True
+        left[first : max(0, len(episode) - last)] = True
         if still:
             state = as_rows(episode.columns[names.STATE])
             after = as_rows(episode.columns.get(names.NEXT_STATE, np.concatenate([state[1:], state[-1:]])))

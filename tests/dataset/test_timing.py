@@ -42,6 +42,7 @@ def test_time_goes_from_both_ends_and_what_lost_its_end_is_truncated(
         assert one.columns[TRUNCATED].tolist() == one.columns[DONE].tolist() == [*[False] * (len(one) - 1), True]
         assert not one.columns[TERMINATED].any() and one.metadata["success"] is False
         assert one.metadata["return"] == pytest.approx(whole[REWARD][2:-4].sum(), rel=1e-5)
+    assert len(made(trim(fake, end_s=0.3, out=tmp_path / "end_alone"))) == len(found)
 
 
 def test_an_episode_that_lost_its_failure_has_not_failed(tmp_path: Path) -> None:
