@@ -164,9 +164,9 @@ def _covered(results: Results, scene: style.Scene) -> Mapping[str, list[Map]]:
 @style.style()
 def open_loop_error(results: Results, _: style.Scene) -> Figure | None:
     """Draw the error over the horizon, one panel per quantity (named with its unit), on logarithmic axes."""
-    if not results.errors:
-        return None
     means = results.mean_errors()
+    if means.empty:
+        return None
     rows = [row for row in results.groundings() if (row, "grounded") in means.index]
     quantities = list(dict.fromkeys(means.index.get_level_values("quantity")))
     horizons = means.index.get_level_values("horizon").unique()

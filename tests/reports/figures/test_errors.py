@@ -39,6 +39,8 @@ def test_open_loop_error_is_logarithmic_and_draws_a_shared_raw_simulator_once() 
     assert axes.get_ylabel() == "position error (m)" and legend(figure) == ["no grounding", "NAS", "ASTRA"]
     assert np.asarray(axes.lines[0].get_xydata()).tolist() == [[1.0, 1.0], [10.0, 2.0]]
     assert len(axes.collections) == 3 and open_loop_error(with_errors({}), SCENE) is None
+    of_smaller = [one.model_copy(update={"percent": 50}) for one in with_errors({"nas": 1.0}, "position_m").errors]
+    assert open_loop_error(results(errors=of_smaller, lines=[line("iql", 0, TESTED, success=0.5)]), SCENE) is None
 
 
 def test_raw_simulators_that_differ_are_all_drawn_and_units_follow_from_the_names() -> None:
