@@ -24,6 +24,7 @@ from astra_data.pipeline.display import display, shown
 from astra_data.pipeline.executors import EXECUTORS, Item
 from astra_data.pipeline.experiment import (
     ALWAYS_NEW,
+    MADE_WITH,
     Condition,
     Experiment,
     condition,
@@ -224,6 +225,10 @@ def make(
         _check_task(experiment, "cpu" if engine == "ray" else device)
         clean(folder)
         again = to_make_again(items, experiment)
+        for key in again:  # a robot's logs, say
+            if STAGES[stage_of_key(key)].makes_dataset and not (folder / MADE_WITH / f"{key}.json").is_file():
+                advice = "restore it from a copy, recover its intact episodes with `astra-data repair`, or remove it"
+                raise BadInputError(f"{folder / key} is {again[key]}, and was not made by this recipe: {advice}")
         items = [one for one in items if one.key in again or one.stage in ALWAYS_NEW or not experiment.has(one.key)]
         data = data_condition(recipe) if any(item.stage == "label" for item in items) else None
         _check_inputs(experiment, items, planned)

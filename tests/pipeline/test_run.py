@@ -154,6 +154,14 @@ def test_altered_values_of_a_dataset_are_made_again_once_a_step_reads_them(
     assert stages.made[:3] == ["report", "collect/seed_0", "pair/seed_0"] and states(recipe) == {}
 
 
+def test_a_damaged_dataset_that_no_stage_made_is_not_replaced(recipe: Path, folder: Path) -> None:
+    (folder / "made_with/collect/seed_0.json").unlink()
+    (description := folder / "collect/seed_0/meta/astra/dataset.json").write_text("{")
+    with pytest.raises(BadInputError, match=r"collect/seed_0 is damaged .* and was not made by this recipe: restore"):
+        run(recipe, root=recipe.parent)
+    assert description.read_text() == "{" and not (folder / "set_aside").exists()
+
+
 def test_an_artifact_of_another_input_is_stale(recipe: Path, folder: Path, stages: FakeStages) -> None:
     recipe.write_text(HEAD.replace("[0]", "[0, 1]"))
     run(recipe, root=recipe.parent)
