@@ -1,7 +1,6 @@
 """A robot that follows its commands late, in what is known of it."""
 
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +8,6 @@ import pytest
 
 from astra_data.core.arrays import Floats
 from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE, Column, Episode
-from astra_data.dataset.reader import Dataset
 from astra_data.dataset.writer import DatasetWriter
 from astra_data.grounding import diagnosis
 from astra_data.pipeline.stages.pair import pair
@@ -35,8 +33,6 @@ class Axes:
         return self.state
 '''
 
-ABOUT = {"name": "logs", "stage": "import"}
-
 
 def recorded(
     folder: Path,
@@ -47,10 +43,11 @@ def recorded(
     gains: tuple[float, float] = (0.9, 0.5),
     drift: str = "",
     deaf: bool = False,
+    falls: int = 0,
 ) -> diagnosis.Diagnosis:
     """Return the diagnosis of 12 recordings of 150 steps, in which commands act `dead` steps late and with a lag.
 
-    A current moves x, the same in a recording or drawn in each step.
+    A current moves x, the same in a recording or drawn in each step; the first `falls` of them end at once.
     """
     (folder / "axes.py").write_text(
         SIMULATOR.replace("* action", "* action * torch.tensor([0.9, 0.0])") if deaf else SIMULATOR
@@ -58,7 +55,8 @@ def recorded(
     rng, follows = np.random.default_rng(0), 1.0 if not lag_s else 1 - np.exp(-0.1 / lag_s)
     columns = [Column(STATE, size=5, names=("x", "y", "vx", "vy", "current")), Column(NEXT_STATE, size=5)]
     columns += [Column(ACTION, size=2, names=("pull", "push"))]
-    with DatasetWriter(folder / "logs", columns, fps=10, task="rail", description=ABOUT) as writer:
+    about = {"name": "logs", "stage": "import"}
+    with DatasetWriter(folder / "logs", columns, fps=10, task="rail", description=about) as writer:
         for number in range(12):
             command = rng.uniform(-1.0, 1.0, (170, 2)).repeat(rng.integers(1, 6, 170), axis=0)[:170]
             if same:
@@ -73,7 +71,8 @@ def recorded(
                 state[step + 1, 2:4] = velocity
             values = {STATE: state[:-1], NEXT_STATE: state[1:], ACTION: command[10:160]}
             kinds = {column.name: column.dtype for column in columns}
-            writer.add(Episode(number, {name: each.astype(kinds[name]) for name, each in values.items()}, {}))
+            ends = 1 if number < falls else 150
+            writer.add(Episode(number, {name: each[:ends].astype(kinds[name]) for name, each in values.items()}, {}))
     simulator = f"{folder / 'axes.py'}:Axes"
     return diagnosis.diagnose(pair(simulator, dataset=folder / "logs", out=folder / "pairs"), simulator)
 
@@ -156,18 +155,10 @@ def test_how_far_it_is_is_told(tmp_path: Path) -> None:
     assert lags > 1 and notes == expected
 
 
-def test_recordings_that_are_too_short_count_for_no_forecast(tmp_path: Path) -> None:
-    """Eleven falls, and a drive with its copies."""
-    recorded(tmp_path)
-    logs, simulator = Dataset.open(tmp_path / "logs"), f"{tmp_path / 'axes.py'}:Axes"
-    drive, *others = logs.episodes()
-    with DatasetWriter(tmp_path / "few", logs.schema, fps=10, task="rail", description=ABOUT) as writer:
-        for fall in others:
-            writer.add(replace(fall, columns={name: values[:6] for name, values in fall.columns.items()}))
-        for uid in range(100, 114):
-            writer.add(replace(drive, uid=uid, metadata={"source_episode": 0}))
-    found = diagnosis.diagnose(pair(simulator, dataset=tmp_path / "few", out=tmp_path / "few_pairs"), simulator)
-    assert found.recordings == 12 and not found.forecast and not found.explained
+@pytest.mark.parametrize(("falls", "explained"), [(5, 4), (11, 0)])
+def test_recordings_that_are_too_short_count_for_no_forecast(tmp_path: Path, falls: int, explained: int) -> None:
+    found = recorded(tmp_path, falls=falls)
+    assert found.recordings == 12 and len(found.explained) == explained and not found.forecast
 
 
 def test_commands_that_only_vary_together_are_warned_of(tmp_path: Path) -> None:

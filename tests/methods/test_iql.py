@@ -5,10 +5,10 @@ from typing import Any
 
 import pytest
 import torch
-from spending import SPENT, spend
 from stopping import Stopped
 from toy_episodes import toy_episodes
 
+from astra_data.core import checkpoint as checkpoints
 from astra_data.core.progress import Progress, silent
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.simulator import NO_GROUNDING
@@ -152,18 +152,18 @@ def test_after_an_interruption_it_goes_on(
     def stop(done: float, note: str) -> None:
         raise Stopped
 
-    def watch(done: float, note: str) -> None:
-        seen.append(done)
-
     with pytest.raises(Stopped):
         learn(given, stop)
     assert not checkpoint.exists()
     with pytest.raises(Stopped):
         learn(given, lambda done, note: stop(done, note) if done == 1.0 else None)
-    spend(checkpoint)
-    resumed, again = learn(given, watch)
+    spent = {"wall_seconds": 1000.0, "cpu_seconds": 2000.0}
+    with checkpoints.resumed(checkpoint) as (state, told):
+        assert told["spent"].keys() >= spent.keys()
+        checkpoints.save_state(checkpoint, state, told | {"spent": told["spent"] | spent})
+    resumed, again = learn(given, lambda done, note: seen.append(done))
     assert seen == [1.0] and again["points"] == curve["points"]
-    assert all(seconds < again[clock] < seconds + 500 for clock, seconds in SPENT.items())
+    assert all(seconds < again[clock] < seconds + 500 for clock, seconds in spent.items())
     whole.save(tmp_path / "whole")
     resumed.save(tmp_path / "resumed")
     assert (tmp_path / "whole").read_bytes() == (tmp_path / "resumed").read_bytes()

@@ -2,6 +2,8 @@
 
 import json
 from collections.abc import Iterator
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +13,6 @@ import torch
 from command_line import call
 from quick_runs import fit_quickly, run_here
 from rail_run import rail_run
-from recordings_of_rerun import read, scalars
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.reader import Dataset
@@ -22,6 +23,7 @@ from astra_data.pipeline.run_view import view_run
 from astra_data.pipeline.trained_policy import settings_of
 from astra_data.robots.registry import task_named
 
+RrdReader = import_module("rerun.chunk" if find_spec("rerun.chunk") else "rerun.experimental").RrdReader
 CART = Path(__file__).parents[2] / "recipes/examples/cart"
 RECIPE = f"""
 task = "{CART}/robot.py:TASK"
@@ -41,6 +43,20 @@ held_out_share = 0.25
 """
 LIMITS = torch.tensor([[-0.2, -1.5], [1.0, 1.5]])
 """Of v in m/s and w in rad/s."""
+
+
+def read(path: Path) -> dict[str, dict[str, Any]]:
+    """Return what a recording holds: entity to component, "step" and "time" (in ns) to its rows."""
+    found: dict[str, dict[str, Any]] = {}
+    for chunk in RrdReader(path).stream():
+        batch = chunk.to_record_batch()
+        for name, column in zip(batch.schema.names, batch.columns, strict=True):
+            found.setdefault(str(chunk.entity_path), {})[name] = column
+    return found
+
+
+def scalars(table: dict[str, Any]) -> np.ndarray[Any, Any]:
+    return np.array(table["Scalars:scalars"].to_pylist())[:, 0]
 
 
 @pytest.fixture(scope="module")

@@ -8,9 +8,9 @@ from io import BytesIO
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from fake_dataset import write_fake
-from fake_report import COMMAND, FIGURES, REPLAY, images, make, task
 from fake_runs import (
     ROWS,
     SEEDS,
@@ -31,11 +31,46 @@ from astra_data.core.durable import file_digest
 from astra_data.core.errors import BadInputError, MissingStageError
 from astra_data.core.naming import artifact_key
 from astra_data.pipeline.stages import report as stage
+from astra_data.pipeline.stages.report import ReportConfig, report
 from astra_data.reports.figures import catalog as figures
-from astra_data.reports.results import read_results
-from astra_data.worlds.objective import RETURN, SURVIVED_STEPS
+from astra_data.reports.results import Results, read_results
+from astra_data.worlds.objective import RETURN, SUCCESS, SURVIVED_STEPS
+from astra_data.worlds.plane.mazes import U_MAZE
 
 DRAWN = figures.drawn
+REPLAY = (np.arange(4, dtype=np.float64), np.zeros((4, 2)), np.zeros((4, 4)), np.zeros((2, 4, 4)))
+FIGURES = {"success", "trajectories", "mismatch", "learning", "gap", "validity"}
+CONFIG = ReportConfig(trajectory_episodes=2)
+COMMAND = "astra-data run recipes/antmaze_u.toml"
+
+
+def task(**changes: object) -> SimpleNamespace:
+    usual: dict[str, object] = {
+        "name": "antmaze-u",
+        "photograph": None,
+        "plane": U_MAZE,
+        "ball_index": None,
+        "facts": {},
+        "timestep_s": 0.1,
+    }
+    objective = SimpleNamespace(scores=(SUCCESS,), action_size=2, horizon=100)
+    return SimpleNamespace(**usual | {"objective": objective, "make_target": object()} | changes)
+
+
+def images(folder: Path) -> set[str]:
+    return {path.stem for path in folder.glob("*.png")}
+
+
+def make(
+    root: Path,
+    publish: Path | None = None,
+    recipe: FakeRecipe | None = None,
+    published: tuple[Path, ...] = (),
+    config: ReportConfig = CONFIG,
+) -> Results:
+    """Write the report, and return its results."""
+    report(recipe or FakeRecipe(), root=root, command=COMMAND, publish=publish, published=published, config=config)
+    return read_results(root / "report/results.json")
 
 
 @pytest.fixture(autouse=True)
