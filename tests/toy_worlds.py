@@ -1,12 +1,14 @@
 """Batched environments so small that what a learner should make of them is known."""
 
 from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
-from kept_states import came_back
 from torch import Tensor
 
+from astra_data.core.checkpoint import resumed, save_state
 from astra_data.policies.learner import Learner
 from astra_data.worlds.protocols import Step
 
@@ -132,6 +134,14 @@ def train(learner: Learner) -> list[dict[str, float]]:
     while not learner.done:
         metrics.append(learner.iterate())
     return metrics
+
+
+def came_back(state: dict[str, Any]) -> dict[str, Any]:
+    """Return what a training that resumes from `state` is given."""
+    with TemporaryDirectory() as folder:
+        save_state(Path(folder) / "checkpoint.pt", state, {})
+        with resumed(Path(folder) / "checkpoint.pt") as (read, _):
+            return read
 
 
 def assert_resumes(begin: Callable[[], Any], learned: str = "policy") -> None:

@@ -3,9 +3,9 @@ from typing import Any
 
 import pytest
 import torch
-from kept_states import came_back
 from pydantic import ValidationError
 from torch import Tensor
+from toy_worlds import came_back
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import derive

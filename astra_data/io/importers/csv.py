@@ -125,9 +125,11 @@ def _joined(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     numbers = [time, *_plain(mapping.fields)]
     main, *rest = mapping.files
     tables: dict[str, dict[str, Array]] = {}
+    is_torn = False
     for name in (main, *rest):
         fields = [time, *_plain(f for f in mapping.all_fields if f.startswith(f"{name}:"))]
         block = _read(source.parts[name], fields, numbers)
+        is_torn |= name == main and block is not None and block.torn > 0
         tables[name] = {
             f"{name}:{field}" if field != time else time: np.asarray(block.values[field]) if block else np.empty(0)
             for field in fields
@@ -153,11 +155,12 @@ def _joined(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     notes = (lost,) if len(kept) < len(now) else ()
 
     def line(row: int) -> int:
-        return line_of(source.parts[main], int(kept[row]))
+        return line_of(source.parts[main], int(kept[row]) if row < len(kept) else len(now))
 
     for first, rows in zip(begins, np.split(kept, begins[1:]), strict=False):
         part = {field: column[rows] for field, column in values.items()}
-        yield Block(part, str(source), starts=first > 0, row=first, line=line, notes=() if first else notes)
+        torn = is_torn and first == begins[-1]
+        yield Block(part, str(source), first > 0, torn, notes=() if first else notes, line=line, row=first)
 
 
 def _plain(fields: Iterable[str]) -> list[str]:

@@ -148,7 +148,10 @@ gap_s = 0.15
 def test_files_of_one_recording_are_joined_by_time(tmp_path: Path) -> None:
     joined(tmp_path / "logs", "run1_")
     joined(tmp_path / "logs/other", "", lost=slice(20, 30))
+    with (tmp_path / "logs/other/state.csv").open("a") as cut_off:
+        cut_off.write("4000,4")
     dataset, report = imported(tmp_path, tmp_path / "logs", JOINED)
+    assert (report.tally.torn_rows, report.tally.torn_first) == (1, "other/state.csv line 42")
     before, after, first = dataset.episodes()
     # The first command comes at 0.3 s, so the first row is that of the same time.
     assert first.columns["observation.state"][:2].tolist() == [[3, -3], [4, -4]]
