@@ -129,6 +129,14 @@ def shown(recording: dict[str, dict[str, Any]]) -> set[int]:
     return {int(entity.split("/")[1].split("_")[1]) for entity in recording if "episode" in entity}
 
 
+def test_those_held_out_of_a_share_of_the_recordings_are_shown(run: Path, tmp_path: Path) -> None:
+    head, _, tables = RECIPE.partition("[collect]")
+    data = f'data = "{run / "collect/seed_3"}"\n[sweep]\npercent = [50]\n'
+    (tmp_path / "half.toml").write_text(head + data + tables[tables.index("[ground]") :])
+    view_run(run_here(tmp_path / "half.toml", until="ground", seeds=[3]), save=tmp_path / "half.rrd")
+    assert len(shown(read(tmp_path / "half.rrd"))) == 1
+
+
 def test_episodes_are_chosen_by_their_uids(run: Path, tmp_path: Path) -> None:
     uid = max(uid for uid, _, _ in recorded_steps(run))
     view_run(run, [uid], save=tmp_path / "one.rrd")
