@@ -30,6 +30,7 @@ COLUMNS = (
     *keys.OUTCOME_COLUMNS,
     keys.Column("mode", "int64", meaning="which gait"),
 )
+NEXT = keys.Column(keys.NEXT_STATE, size=3)
 DESCRIPTION: Mapping[str, Any] = {
     "name": "fake",
     "stage": "collect",
@@ -39,6 +40,8 @@ DESCRIPTION: Mapping[str, Any] = {
 }
 SETTINGS: Mapping[str, Any] = {"columns": COLUMNS, "fps": 20, "task": "run", "description": DESCRIPTION}
 LENGTHS = (7, 1, 12, 30, 5)
+NAMES = (keys.STATE, keys.ACTION, keys.REWARD, keys.TERMINATED, "mode", keys.INDEX)
+"""Columns that tests draw from."""
 
 
 def fake_columns(length: int, seed: int) -> dict[str, keys.Array]:
@@ -78,6 +81,20 @@ def write_fake(root: Path, **changes: Any) -> Dataset:
     with writer(root, **changes) as open_writer:
         for episode in fake_episodes():
             open_writer.add(episode)
+    return Dataset.open(root)
+
+
+def write_transitions(root: Path, *, has_goal: bool = True) -> Dataset:
+    """Five episodes in which every next state is the state of the next step."""
+    extra = (NEXT, keys.Column(keys.GOAL, size=2)) if has_goal else (NEXT,)
+    with writer(root, columns=[*COLUMNS, *extra]) as open_writer:
+        for number, episode in enumerate(fake_episodes()):
+            state = episode.columns[keys.STATE]
+            added: dict[str, keys.Array] = {keys.NEXT_STATE: np.concatenate([state[1:], state[:1] + 1])}
+            if has_goal:
+                added[keys.GOAL] = np.full((len(episode), 2), number, np.float32)
+            metadata = dict(episode.metadata) | ({"seed": 3} if number == 1 else {})
+            open_writer.add(keys.Episode(episode.uid, {**episode.columns, **added}, metadata))
     return Dataset.open(root)
 
 

@@ -9,8 +9,7 @@ from types import SimpleNamespace
 
 import lerobot_recordings
 import pytest
-from fake_dataset import fake_columns, write_fake, writer
-from fake_frames import NAMES
+from fake_dataset import NAMES, fake_columns, write_fake, writer
 from shared_runs import shared
 
 from astra_data.dataset import parquet

@@ -4,14 +4,24 @@ import numpy as np
 import pytest
 import torch
 from failing_disk import small_files
-from fake_dataset import COLUMNS, LENGTHS, concatenated
-from fake_frames import NAMES, assert_equal, everything
+from fake_dataset import COLUMNS, LENGTHS, NAMES, concatenated
 from torch.utils.data import DataLoader
 
 from astra_data.core.errors import BadInputError, CorruptDatasetError, DiskError
 from astra_data.dataset import Dataset
 from astra_data.dataset.columns import INDEX, STATE
-from astra_data.dataset.frames import Batches, Frames
+from astra_data.dataset.frames import Batch, Batches, Frames, Samples
+
+
+def everything(samples: Samples) -> Batch:
+    return samples.__getitems__(range(len(samples)))
+
+
+def assert_equal(found: Batch, expected: Batch) -> None:
+    assert list(found) == list(expected)
+    for name, values in expected.items():
+        assert found[name].dtype == values.dtype
+        assert torch.equal(found[name], values), name
 
 
 def test_columns_are_the_datasets(fake: Dataset) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from damaged import DATA, alter_rows
+from fake_dataset import write_transitions
 from lerobot_recordings import JOINTS, values
 from typer.testing import CliRunner
 
@@ -111,8 +112,6 @@ def test_damage_is_found_before_anything_is_made_of_it(
 
 
 def test_a_dataset_of_ours_without_its_metadata_keeps_uids_and_next_states(tmp_path: Path) -> None:
-    from fake_transitions import write_transitions  # noqa: PLC0415
-
     ours = write_transitions(tmp_path / "set")
     bare = Dataset.open(shutil.copytree(ours.root, tmp_path / "bare", ignore=shutil.ignore_patterns("astra")))
     assert bare.uids.tolist() == ours.uids.tolist() and bare.content_hash == ours.content_hash

@@ -6,8 +6,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from fake_dataset import COLUMNS, LENGTHS, fake_columns, write_fake, writer
-from fake_transitions import NEXT, write_transitions
+from fake_dataset import COLUMNS, LENGTHS, NEXT, fake_columns, write_fake, write_transitions, writer
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED, Column, Episode
