@@ -35,6 +35,13 @@ def episodes(speed: float) -> PairedEpisodes:
     return toy_episodes(state[:, :-1], action, next_state=state[:, 1:], simulated_next=simulated, mask=mask)
 
 
+def scattered() -> ScatterModel:
+    """Return a scatter of one form, drawn at every step."""
+    made = ScatterModel(ScatterShape(8 + 2 + 4 + 16, 4, 1)).requires_grad_(False)
+    made.forms.fill_(1.0)
+    return made
+
+
 def untrained() -> HistoryGrounding:
     return HistoryGrounding(GroundingModel(GroundingShape(4, 2, 2, latent_size=8, head_sizes=(8,))))
 
@@ -62,9 +69,7 @@ def test_a_constant_correction_closes_a_constant_gap() -> None:
     assert report["grounded"]["position_m"]["mean"] == pytest.approx([0.0] * 3, abs=2e-3)
     went_m = [0.5 * 0.5 * TASK.timestep_s * steps for steps in (1, 10, 50)]
     assert report["still"]["position_m"]["mean"] == pytest.approx(went_m, rel=1e-3)
-    scattered = ScatterModel(ScatterShape(8 + 2 + 4 + 16, 4, 1))
-    scattered.forms.fill_(1.0)
-    assert gap_report(TASK, replace(grounding, scatter_model=scattered), one, seed=0) == report
+    assert gap_report(TASK, replace(grounding, scatter_model=scattered()), one, seed=0) == report
 
 
 def test_the_last_real_step_counts_and_the_one_after_does_not() -> None:
@@ -152,14 +157,16 @@ def test_a_simulator_that_diverges_is_told() -> None:
 REPLAYED = 6
 
 
-@pytest.mark.parametrize("grounding", [NO_GROUNDING, HistoryGrounding(model(), failure_model())])
+@pytest.mark.parametrize(
+    "grounding", [NO_GROUNDING, HistoryGrounding(model(), failure_model(), scatter_model=scattered())]
+)
 def test_recorded_commands_are_replayed_from_where_episodes_began(grounding: Grounding) -> None:
     """Three episodes that start apart; where the target went afterwards is not to be seen in a replay."""
     torch.manual_seed(1)
     state = HERE + torch.cat([0.2 * torch.rand(3, REPLAYED, 2), torch.zeros(3, REPLAYED, 2)], dim=-1)
     episodes = toy_episodes(state, 2 * torch.rand(3, REPLAYED, 2) - 1, next_state=state)
     found = replay_open_loop(TASK, grounding, episodes, seed=0)
-    simulator = grounding.simulator(TASK, 3)
+    simulator = grounding.for_replay().simulator(TASK, 3)
     simulator.start(state[:, 0], torch.arange(3), torch.zeros(3, 2))
     assert torch.equal(found[:, 0], state[:, 0]) and found.shape == (3, REPLAYED + 1, 4)
     for step in range(REPLAYED):

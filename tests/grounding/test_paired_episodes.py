@@ -197,6 +197,9 @@ def test_what_tells_the_place_is_dropped_if_phi_drops_it(
     (root / "meta/info.json").write_text(json.dumps(info))
     reseal(root)
     assert PairedEpisodes.load(root).dropped_place == dropped
+    assert not PairedEpisodes.load(
+        root, inputs=(keys.STATE,)
+    ).dropped_place  # what the encoder is given has other entries
 
 
 def test_pairs_of_another_task_are_told_with_every_mismatch(tmp_path: Path) -> None:

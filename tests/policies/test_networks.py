@@ -149,3 +149,14 @@ def test_a_student_acts_like_its_teacher_where_it_estimates_well_and_holds_nothi
     assert not any(name.startswith("encoder") for name in student.state_dict())
     learned = {name.split(".")[0] for name, value in student.named_parameters() if value.requires_grad}
     assert learned == {"adaptation"}
+
+
+@torch.no_grad()
+def test_a_history_is_convolved_along_time() -> None:
+    """The order of what a row is embedded as has no meaning."""
+    torch.manual_seed(0)
+    made, history, order = networks.HistoryEstimate(5, 45, 4), torch.randn(6, 45 * 5), torch.randperm(32)
+    estimate, (first, *_) = made(history), made.convolutions
+    for values in (made.embedding.weight, made.embedding.bias, first.weight.transpose(0, 1)):
+        values.copy_(values[order])
+    torch.testing.assert_close(made(history), estimate)

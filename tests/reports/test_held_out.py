@@ -107,6 +107,9 @@ def test_rows_may_have_other_sizes(tmp_path: Path) -> None:
     rows = [line.split(" | ")[:2] for line in text.splitlines() if "%" in line and "|" in line]
     sizes = {"| 25 %": "NAS, grounded", "| 100 %": "ASTRA, grounded"}
     assert rows == [[size, shown] for size, row in sizes.items() for shown in ("No grounding", row)]
+    write(tmp_path, 100, 0, 0.3)  # of another simulator
+    text = page(tmp_path, 100, rows=("nas", "astra"))
+    assert "| NAS, no grounding | 0.6 [" in text and "| ASTRA, no grounding | 0.2 [" in text
 
 
 def test_nothing_finished_is_no_page_and_a_malformed_file_one_line(tmp_path: Path) -> None:

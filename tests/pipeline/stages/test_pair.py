@@ -264,7 +264,7 @@ def test_a_heading_that_wraps_is_told(
         "        self.state = torch.zeros(num_envs, 2)\n"
         "    def abstraction(state):\n"
         "        abstract = state[..., [0, 2]]\n"
-        f"        abstract[..., 1] *= {scale}\n"
+        f"        abstract[..., 1] = {scale} * abstract[..., 1] - {180 * (scale > 1)}\n"
         "        return abstract\n"
         "    def reset_to(self, state, rows=None):\n"
         "        self.state = state.clone()\n"
