@@ -17,8 +17,9 @@ LATENT_ALONE = LossWeights(latent=0.0, reward=0.0)
 
 
 @pytest.fixture(autouse=True)
-def _scatter_is_fitted_briefly(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(history, "_DESCENT", DescentConfig(updates=100, learning_rate=2e-3))
+def _all_is_fitted_briefly(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, updates in (("_DESCENT", 100), ("_HITS_DESCENT", 700)):
+        monkeypatch.setattr(history, name, DescentConfig(updates=updates, learning_rate=2e-3))
 
 
 def ball_model() -> GroundingModel:

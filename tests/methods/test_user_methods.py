@@ -137,7 +137,8 @@ def test_fitted_parameters_are_those_that_were_planted(
     still = CARTS.limits.normal(torch.zeros(2))
     planted = sys.modules[method.fit.__module__].Response(*map(torch.tensor, (gain, offset, share)), still, delay)
     training, held_out = late_carts(planted, 20, 0), late_carts(planted, 4, 1)
-    given = Fitting(CARTS, GroundConfig(), method.table.model(), training, held_out, 0, "cpu", tmp_path, silent)
+    settings = method.table.model(windows=100, longest_delay=3)
+    given = Fitting(CARTS, GroundConfig(), settings, training, held_out, 0, "cpu", tmp_path, silent)
     grounding, figures = method.fit(given)
     assert figures["delay"] == delay
     for name, values in (("gain", gain), ("offset", offset), ("share", share)):

@@ -156,7 +156,7 @@ def test_a_history_is_convolved_along_time() -> None:
     """The order of what a row is embedded as has no meaning."""
     torch.manual_seed(0)
     made, history, order = networks.HistoryEstimate(5, 45, 4), torch.randn(6, 45 * 5), torch.randperm(32)
-    estimate, (first, *_) = made(history), made.convolutions
-    for values in (made.embedding.weight, made.embedding.bias, first.weight.transpose(0, 1)):
+    estimate, first = made(history), made.convolutions.get_parameter("0.weight")
+    for values in (made.embedding.weight, made.embedding.bias, first.transpose(0, 1)):
         values.copy_(values[order])
     torch.testing.assert_close(made(history), estimate)
