@@ -5,11 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fake_dataset import writer
+from fake_stages import FakeStages
 from typer.testing import CliRunner
 
 from astra_data.cli.app import app
 from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE, Column, Episode
+from astra_data.pipeline.executors import EXECUTORS
 from astra_data.pipeline.run import check, run
 from astra_data.pipeline.stages.pair import pair
 
@@ -42,7 +44,8 @@ def write_logs(
 
 
 @pytest.fixture
-def recipe(tmp_path: Path) -> Path:
+def recipe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setitem(EXECUTORS, "processes", FakeStages().run_here)
     shutil.copy(ROOT / "tests/small_cart.py", tmp_path / "rail.py")
     path = tmp_path / "rail.toml"
     path.write_text('task = "rail.py:TASK"\ndata = "logs"\nmethods = ["nas"]\nseeds = [0]\n')
@@ -77,7 +80,7 @@ def test_steps_that_do_not_lead_to_the_row_after_them_are_told(
     found = check(recipe, root=recipe.parent / "runs")["data"]
     what = f"steps whose {NEXT_STATE} is not the state of the next row: 16 of 16: rows are missing"
     assert found.state == "finished" and found.warnings[0].startswith(what)
-    run(recipe, root=recipe.parent / "runs", until="label", jobs=1)
+    run(recipe, root=recipe.parent / "runs", until="label")
     assert f"warning: data: {found.warnings[0]}\n" in capsys.readouterr().out
 
 
@@ -94,9 +97,9 @@ def test_data_are_not_asked_for_once_they_are_labeled(recipe: Path, monkeypatch:
     home, runs = recipe.parent / "home", recipe.parent / "runs"
     monkeypatch.setenv("ASTRA_DATA_HOME", str(home))
     write_logs(home / "logs/data-1.0.0", -1.0, 4.0)
-    run(recipe, root=runs, until="label", jobs=1)
+    run(recipe, root=runs, until="label")
     shutil.rmtree(home)
-    run(recipe, root=runs, until="pair", jobs=1)
+    run(recipe, root=runs, until="pair")
     assert (runs / "rail/pair/seed_0").is_dir()
 
 
