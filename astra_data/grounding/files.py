@@ -35,7 +35,13 @@ def save_grounding(path: Path, grounding: FittedGrounding, episodes: PairedEpiso
     tensors, metadata = parts_of(grounding)
     if wrong := not_finite(tensors):
         raise BadInputError(f"fit returned a {type(grounding).__name__} with {wrong}: expected finite values")
-    save_tensors(path, tensors, episodes.named | {"kind": grounding.kind} | metadata)
+    about = episodes.named | {"kind": grounding.kind}
+    if taken := sorted(about.keys() & metadata):
+        raise BadInputError(
+            f"{type(grounding).__name__}.to_file: metadata of the names {', '.join(taken)}, which the package writes: "
+            "rename them"
+        )
+    save_tensors(path, tensors, about | metadata)
 
 
 def load_grounding(path: Path | str, device: str = "cpu") -> FittedGrounding:

@@ -141,13 +141,15 @@ class Cutter:
         masks["back"] = steps_s[:, 1] < 0
         masks["gap"] = np.asarray((steps_s[:, 1:] > (self._mapping.split.gap_s or np.inf)).any(axis=1))
         masks["rejected"] = table["/torn"] | (~table["/finite"] & (self._mapping.not_finite == "split"))
-        self._count_time(table, steps_s)
+        jumps = np.zeros(n, bool)
+        jumps[kept] = self._jumped(table, kept)
+        self._count_time(table, steps_s, masks["field"] | masks["end"] | masks["gap"] | jumps)
         if not len(kept):
             return
         # How often each reason has applied up to each row, but for jumps and what begins the first.
         counts = np.cumsum([masks[reason] for reason in REASONS], axis=1)
         reasons = np.diff(counts[:, kept], axis=1, prepend=counts[:, kept[:1]]) > 0
-        reasons[REASONS.index("jump")] = self._jumped(table, kept)
+        reasons[REASONS.index("jump")] = jumps[kept]
         reasons[REASONS.index(self._begins), 0] = self._has_rows
         self._has_rows = True
         [begins] = np.nonzero(reasons.any(axis=0))
@@ -205,15 +207,15 @@ class Cutter:
         for note in block.notes:
             tally.topics.setdefault(note.removeprefix(f"{block.origin}: "), []).append(block.origin)
 
-    def _count_time(self, table: Table, steps_s: Array) -> None:
+    def _count_time(self, table: Table, steps_s: Array, begins: Bools) -> None:
+        """Count what is wrong with times, and how much passes in steps that begin no episode, as `begins` says."""
         recorded, held, kept = steps_s.T
         stands = (held == 0) & np.isfinite(recorded)
         for name, mask in (("back", held < 0), ("still", stands)):
             setattr(self.tally, f"{name}_rows", getattr(self.tally, f"{name}_rows") + int(mask.sum()))
             if mask.any() and not getattr(self.tally, f"{name}_first"):
                 setattr(self.tally, f"{name}_first", self._place(table, int(mask.argmax())))
-        longest = self._mapping.split.gap_s or np.inf
-        regular = (kept > 0) & ~(held > longest) & ~(kept > longest)
+        regular = (kept > 0) & ~begins
         for part in np.unique(table["/part"][regular]):
             steps = kept[regular & (table["/part"] == part)]
             self._spent[part] += steps.sum(), np.median(steps) * len(steps), len(steps)

@@ -5,6 +5,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 from astra_data.core.config import Config, did_you_mean
 from astra_data.core.errors import BadInputError
@@ -13,7 +14,7 @@ from astra_data.grounding.files import kinds
 from astra_data.grounding.fit import HistoryFit
 from astra_data.grounding.simulator import Grounding
 from astra_data.methods import astra, follower, iql
-from astra_data.methods.method import Method, Table
+from astra_data.methods.method import Method, Role, Source, Table
 from astra_data.methods.rma import RMA
 from astra_data.policies.learner import add_policy_kind
 from astra_data.policies.train import InSimulator, UserLearner
@@ -39,7 +40,7 @@ METHODS: dict[str, Method] = {
 }  # by name. Recipes list the methods' tables, and results the settings in them, in this order.
 
 ENTRY_POINTS = "astra_data.methods"  # the group of entry points under which installed packages offer methods
-_NAME = re.compile("[a-z][a-z0-9_]*")
+_NAME, _COLOR = re.compile("[a-z][a-z0-9_]*"), re.compile("#[0-9a-fA-F]{6}")
 _PLACES: dict[str, str] = {}
 """Where the methods come from that are none of the package's, by name; in this process each name is one."""
 
@@ -79,25 +80,45 @@ def add_method(name: str, place: str) -> None:
 
 def _faults(method: Method) -> Iterator[str]:
     """Yield what a method of the user's lacks to be a row."""
-    if method.learn is None:
+    if method.color and not _COLOR.fullmatch(method.color):
+        yield f'has the color {method.color!r}: expected "#rrggbb"'
+    choices = {"role": (None, *get_args(Role)), "learns_from": get_args(Source), "configures": ("ground", "train")}
+    for name, known in choices.items():
+        if (value := getattr(method, name)) not in known:
+            yield f"has {name}={value!r}: expected {', '.join(map(repr, known))}"
+    if method.fit is not None and not callable(method.fit):
+        yield f"has fit={method.fit!r}: expected a function"
+    table, grounding, learn = method.table, method.grounding, method.learn
+    policy = learn.policy if isinstance(learn, UserLearner) else None
+    classes = {"grounding": grounding, "policy": policy, "table": table and table.model}
+    if objects := [name for name, made in classes.items() if made is not None and not isinstance(made, type)]:
+        yield f"has an object as {', '.join(objects)}: expected its class"
+        return
+    if learn is None:
         yield "learns no policy: expected learn, an UserLearner that returns one"
-    if (made := method.grounding) is not None:
-        abstract = getattr(made, "__abstractmethods__", ())
-        missing = [one for one in ("kind", "to_file", "from_file") if one in abstract or not hasattr(made, one)]
-        if missing or not issubclass(made, Grounding):
-            lacks = f"has a grounding, {made.__name__}, without {', '.join(missing) or 'the other parts'}"
-            yield f"{lacks}: expected a subclass of FittedGrounding"
-    if (table := method.table) is None:
+    elif policy and (missing := _missing(policy, "act")):
+        yield f"learns a {policy.__name__}, without {missing}: expected the class of what learn returns"
+    if grounding and method.fit is None:
+        yield "has a grounding that nothing fits: expected fit"
+    others = "" if not grounding or issubclass(grounding, Grounding) else "the other parts"
+    if grounding and (missing := _missing(grounding) or others):
+        yield f"has a grounding, {grounding.__name__}, without {missing}: expected a subclass of FittedGrounding"
+    if table is None:
         return
     if not issubclass(table.model, Config):
-        yield (
-            f"has settings of {table.model.__name__}, which is no astra_data.core.config.Config: expected "
-            f"class {table.model.__name__}(Config)"
-        )
+        name = table.model.__name__
+        yield f"has settings of {name}, which is no astra_data.core.config.Config: expected class {name}(Config)"
     elif method.configures == "ground" and method.fit is None:
         yield 'has settings that nothing reads: configures="ground" needs fit'
     elif method.configures == "train" and type(method.learn) is InSimulator:
         yield 'has settings that nothing reads: expected configures="ground" if they are those of fit'
+
+
+def _missing(made: type, *more: str) -> str:
+    """Return what a class lacks of what is needed to read its files."""
+    abstract = getattr(made, "__abstractmethods__", ())
+    missing = [one for one in ("to_file", "from_file", *more) if one in abstract or not hasattr(made, one)]
+    return ", ".join(missing if isinstance(getattr(made, "kind", None), str) else ["kind, a string", *missing])
 
 
 def is_of_package(name: str) -> bool:

@@ -114,7 +114,7 @@ def run_item(key: str, work: bytes, log: Path, send: Callable[[Note], object]) -
     is removed if that is nothing.
     """
     began = time.perf_counter()
-    with _printing_to(log):
+    with _printing_to(log.absolute()):
         try:
             prepare, call = pickle.loads(work)
             if prepare:

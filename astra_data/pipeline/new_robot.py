@@ -180,6 +180,8 @@ def _objective(simulator: SimulatorKind, values: dict[str, str]) -> str:
         "constants": "".join(sizes),
         "goal_line": "" if taken else f"GOAL = {_code(tuple(goal * shares))}  # CHECK: where to go\n",
         "close": f"{way / 10:.2g}",
+        "also": ", and the other states" if len(simulator.names) > 4 else "",
+        "others": ", *state[..., 4:].unbind(-1)" if len(simulator.names) > 4 else "",
         "range": f"{way:.3g}" if is_planar else _code(tuple(spans)),
     }
     return filled("planar.py" if is_planar else "direct.py", values)

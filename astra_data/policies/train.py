@@ -3,6 +3,7 @@
 import math
 import shutil
 from collections.abc import Callable, Mapping
+from contextlib import chdir
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -36,6 +37,7 @@ from astra_data.policies.simulator_env import (
     training_env,
 )
 from astra_data.worlds.task import Task
+from astra_data.worlds.user_code import parts_of, restored
 
 if TYPE_CHECKING:
     from astra_data.policies.gymnasium import WatchedEnv
@@ -293,9 +295,18 @@ class UserLearner(InSimulator):
         env, simulation = self.world(training)
         watched = WatchedEnv(env, training)
         torch.manual_seed(derive(training.seed, "policy"))
-        learned = self.learn(watched, training)
+        with chdir("."):  # the user's code may leave it
+            learned = self.learn(watched, training)
         if not isinstance(learned, self.policy):
             raise BadInputError(f"learn returned a {type(learned).__name__}, expected a {self.policy.__name__}")
         watched.finish()
-        own = UserPolicy(learned, env.observation_size, env.action_size)
+        sizes, seen = (env.observation_size, env.action_size), env.reset()
+        own, (tensors, metadata) = UserPolicy(learned, *sizes), parts_of(learned)
+        again = UserPolicy(restored(self.policy, dict(tensors), metadata), *sizes)
+        acted, then, written = own.act(seen), own.act(seen), again.act(seen)
+        if torch.equal(acted, then) and not torch.allclose(acted, written, atol=1e-6):
+            raise BadInputError(
+                f"{own.name}.from_file: actions of what it returns are up to {(written - acted).abs().max():.3g} "
+                "from those of what learn returned: expected what to_file wrote"
+            )
         return training.learned(own, simulation), {"points": watched.points}

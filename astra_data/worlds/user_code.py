@@ -62,7 +62,9 @@ def file_of(name: str) -> dict[str, str]:
 
 def user_object(name: str) -> Any:  # noqa: ANN401 - any object
     """Run the file or module that `name` begins with, and return the object that it ends with."""
-    place, _, attribute = name.rpartition(":")
+    place, colon, attribute = name.rpartition(":")
+    if not colon:
+        raise BadInputError(f"{name}: expected a Python file or a module and a name in it, such as {name}:METHOD")
     if not place.endswith(".py") and not all(part.isidentifier() for part in place.split(".")):
         raise BadInputError(f"{place}: expected a Python file, such as cart.py, or a module, package.module")
     with explained(f"importing {place}"):

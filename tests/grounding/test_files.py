@@ -99,6 +99,9 @@ def test_what_a_grounding_of_one_s_own_saves_and_asks_for_is_checked(
     with pytest.raises(BadInputError, match=r"^Shifted.to_file: 'offset' is a ndarray, expected a torch"):
         files.save_grounding(path, SHIFTED, no_episodes())
     assert not path.exists()
+    monkeypatch.setattr(Shifted, "to_file", lambda self: ({"offset": self.shift}, {"kind": "x", "hash": "y", "z": 0}))
+    with pytest.raises(BadInputError, match=r"^Shifted.to_file: metadata of the names hash, kind, which the pack"):
+        files.save_grounding(path, SHIFTED, no_episodes())
     monkeypatch.setattr(Shifted, "to_file", lambda self: ({"offset": self.shift}, {}))
     files.save_grounding(path, SHIFTED, no_episodes())
     told = r"^Shifted.from_file, given the tensors offset and .*, fails with KeyError: 'shift'"

@@ -276,6 +276,7 @@ from pydantic import BaseModel
 from astra_data.core.config import Config
 from astra_data.methods.astra import DIRECT_TRANSFER
 from astra_data.methods.method import Method, Table
+from astra_data.policies.train import UserLearner
 from astra_data.grounding.simulator import FittedGrounding
 class Ours(Config):
     memory: int = 4
@@ -283,6 +284,10 @@ class Theirs(BaseModel):
     memory: int = 4
 class Half(FittedGrounding):
     kind = "half"
+class Whole(FittedGrounding):
+    kind, to_file, from_file, corrected = "whole", 1, 2, 3
+class Kept:
+    to_file, from_file = 1, 2
 def fit(fitting): ...
 METHOD = Method(name="", title="",
 """
@@ -298,7 +303,15 @@ METHOD = Method(name="", title="",
             r"has settings of Theirs, which is no .*Config: expected class Theirs\(Config\)",
         ),
         ("fit=fit, grounding=Half", "has a grounding, Half, without to_file, from_file"),
-        ("learn=None, grounding=Half", "learns no policy.*; .*mine.py:METHOD has a grounding, Half, without"),
+        ("learn=None, fit=fit, grounding=Half", "learns no policy.*; .*mine.py:METHOD has a grounding, Half, without"),
+        ("grounding=Whole", "has a grounding that nothing fits: expected fit"),
+        ("fit='fit'", "has fit='fit': expected a function"),
+        ("fit=fit, grounding=object(), table=Table('mine', Ours())", "has an object as grounding, table: expected its"),
+        ("learn=UserLearner(learn=fit, policy=Kept())", "has an object as policy: expected its class"),
+        ("learn=UserLearner(learn=fit, policy=Kept)", "learns a Kept, without kind, a string, act: expected the cl"),
+        ("color='banana'", "has the color 'banana': expected \"#rrggbb\""),
+        ("role='roof'", "has role='roof': expected None, 'floor', 'ceiling', 'trained there'"),
+        ("learns_from='logs', configures='grond'", "has learns_from='logs': .*; .*has configures='grond': expected 'g"),
     ],
 )
 def test_what_a_method_lacks_is_told_before_anything_runs(tmp_path: Path, rest: str, told: str) -> None:

@@ -97,6 +97,21 @@ def test_a_flag_that_ends_logs_and_goals_are_imported(tmp_path: Path) -> None:
     assert objective.reached(there, elsewhere) and not objective.reached(there, elsewhere + 9)
 
 
+def test_a_policy_sees_all_that_commands_move(tmp_path: Path) -> None:
+    """A height beside a position and a heading."""
+    forward, turn, up = np.sin(np.arange(3)[:, None] + np.arange(200) / 7)
+    yaw = 0.1 * np.cumsum(turn)
+    x, y, z = (0.1 * np.cumsum(speed) for speed in (forward * np.cos(yaw), forward * np.sin(yaw), up))
+    rows = np.stack([np.arange(200) / 10, x, y, z, yaw, forward, turn, up], axis=1)
+    np.savetxt("log.csv", rows, "%.6f", ",", header="t,x,y,z,yaw,cmd_v,cmd_w,cmd_vz", comments="")
+    write_robot("drone", Path("drone"), [Path("log.csv")])
+    task = task_named("drone/drone.py:TASK")
+    high, low = (torch.tensor([[1.0, 2.0, 0.6, 0.8, height]]) for height in (3.0, 0.1))
+    seen = [task.objective.observe(state, torch.zeros(1, 0)) for state in (high, low)]
+    assert seen[0].shape == (1, 3) and torch.equal(seen[0][:, :2], seen[1][:, :2])
+    assert [float(one[0, 2]) for one in seen] == pytest.approx([3.0, 0.1])
+
+
 def test_starts_of_a_heading_are_where_it_was(tmp_path: Path) -> None:
     """It begins from 3 to 3.4 rad, on both sides of where angles wrap."""
     write_robot("cart", Path("cart"), [drives(tmp_path / "logs")])

@@ -1,6 +1,8 @@
 """A learner of the user's in the simulator of a row."""
 
-from collections.abc import Iterable
+import math
+import os
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -119,6 +121,38 @@ def test_its_policy_comes_back_from_the_file(tmp_path: Path) -> None:
     del KINDS["constant"]
     with pytest.raises(BadInputError, match="found kind constant"):
         PolicyFile.load(tmp_path / "policy.safetensors")
+
+
+class Forgetful(Constant):
+    """What its file says is another command."""
+
+    def to_file(self) -> tuple[Mapping[str, torch.Tensor], dict[str, Any]]:
+        return {"command": torch.tensor([0.5])}, {"unit": "none"}
+
+
+class Random(Forgetful):
+    def act(self, observation: Any) -> Any:
+        return np.random.default_rng().uniform(-1, 1, (len(observation), 1))
+
+
+def test_a_policy_that_its_file_does_not_hold_is_refused(tmp_path: Path) -> None:
+    told = r"^Forgetful.from_file: actions of what it returns are up to 0.25 from those of what learn returned"
+    with pytest.raises(BadInputError, match=told):
+        UserLearner(learn=lambda *_: Forgetful(0.25), policy=Forgetful)(training(tmp_path))
+    UserLearner(learn=lambda *_: Random(0.0), policy=Random)(training(tmp_path))  # of one that draws, nobody knows
+    with pytest.raises(BadInputError, match=r"Constant.act: expected finite actions"):
+        UserLearner(learn=lambda *_: Constant(math.nan), policy=Constant)(training(tmp_path))
+
+
+def test_it_may_leave_the_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+    def learn(*_: object) -> Constant:
+        os.chdir("/")
+        return Constant(0.0)
+
+    UserLearner(learn=learn, policy=Constant)(training(tmp_path))
+    assert Path.cwd() == tmp_path
 
 
 def test_a_kind_of_the_package_is_not_replaced(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -66,6 +66,8 @@ def test_what_is_not_there_is_answered_with_what_is(tmp_path: Path) -> None:
     file.write_text("import sys\nfrom pathlib import Path\nTASK = 3\n_HIDDEN = 4\ndef reach(): pass\n")
     with pytest.raises(BadInputError, match=r"mine.py has no 'TAKS'; it has TASK, reach$"):
         user_code.user_object(f"{file}:TAKS")
+    with pytest.raises(BadInputError, match=r"^cart.py: expected a .* and a name in it, such as cart.py:METHOD"):
+        user_code.user_object("cart.py")
     with pytest.raises(BadInputError, match=r"none.py does not exist: expected a Python file"):
         user_code.user_object(f"{tmp_path}/none.py:TASK")
     with pytest.raises(BadInputError, match=f"none.py does not exist in {Path.cwd()}: expected a Python file"):

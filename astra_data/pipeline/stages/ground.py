@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping
+from contextlib import chdir
 from pathlib import Path
 from typing import Any
 
@@ -61,7 +62,8 @@ def ground(
     with finished_folder(out, config=settings_text, made_from=made_from) as folder:
         fitting = Fitting(world, config, settings, training, held_out, seed, device, folder, progress)
         stopwatch = Stopwatch()
-        grounding, metrics = fitted(fit(fitting))
+        with chdir("."):  # code of the user's may leave it
+            grounding, metrics = fitted(fit(fitting))
         fit_end = stopwatch.spent()
         figures = made | fit_end | metrics
         try:
