@@ -10,6 +10,9 @@ from torch import Tensor, nn
 from torch.autograd.function import FunctionCtx
 from torch.nn import functional
 
+from astra_data.core.errors import BadInputError
+from astra_data.worlds.user_code import explained
+
 _LONGEST_M = 16.0  # longest wavelength of position features
 _LEAST = 1e-3  # lower bound of a deviation
 
@@ -91,6 +94,30 @@ class Encoder(nn.Module, ABC):
     def forward(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
         """Return what `sequence` does, as of any network."""
         return self.sequence(inputs)
+
+
+@torch.no_grad()
+def check_encoder(encoder: Encoder, inputs: Tensor) -> None:
+    """Refuse an encoder of the user's whose `sequence` of `inputs` (B, T, I) is not what its steps give."""
+    name, stepped = type(encoder).__name__, list[tuple[Tensor, Tensor]]()
+    encoder.eval()
+    with explained(f"{name}, on inputs of shape {tuple(inputs.shape)},"):
+        latents, memories = encoder.sequence(inputs)
+        memory = encoder.initial(len(inputs))
+        for given in inputs.unbind(1):
+            memory = encoder.step(given, memory)
+            stepped.append((encoder.latent(memory), memory))
+    encoder.train()
+    for what, whole, steps in zip(
+        ("latents", "memories"), (latents, memories), zip(*stepped, strict=True), strict=True
+    ):
+        by_step = torch.stack(steps, dim=1)
+        if whole.shape != by_step.shape:
+            shapes = f"{tuple(whole.shape)}, by step {tuple(by_step.shape)}"
+            raise BadInputError(f"{name}.sequence gives {what} of shape {shapes}: expected the same")
+        if not torch.allclose(whole, by_step, rtol=1e-3, atol=1e-4):
+            apart = f"{(whole - by_step).abs().max():.3g}"
+            raise BadInputError(f"{name}.sequence gives {what} up to {apart} from those of step: expected the same")
 
 
 class HistoryEncoder(Encoder):

@@ -119,7 +119,7 @@ class HistoryFit:
         return grounding, metrics | metrics.pop("stopwatch").spent()
 
     def _fitted(self, fitting: Fitting, *, corrects_reward: bool) -> "tuple[GroundingModel, dict[str, Any]]":
-        from astra_data.grounding.encoder import HistoryEncoder, take_scales
+        from astra_data.grounding.encoder import HistoryEncoder, check_encoder, take_scales
         from astra_data.grounding.model import GroundingModel, GroundingShape, LossWeights, recorded_rewards
 
         config, training, windows = fitting.config, fitting.training, fitting.training.windows
@@ -135,6 +135,9 @@ class HistoryFit:
             encoder=(self.encoder or HistoryEncoder).kind,
         )
         model = GroundingModel(shape).to(fitting.device)
+        if self.encoder:
+            first = windows.state[:2, :5], windows.goal[:2, :5], windows.previous_action[:2, :5]
+            check_encoder(model.encoder, model.encoder_input(*first))
         correction = windows.next_state - windows.simulated_next
         columns = {"state": windows.state, "goal": windows.goal, "correction": correction}
         take_scales(model, {name: training.steps(values) for name, values in columns.items()})

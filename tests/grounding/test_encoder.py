@@ -1,14 +1,16 @@
 import math
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 from toy_episodes import no_episodes
 
+from astra_data.core.errors import BadInputError
 from astra_data.grounding.alignment import TargetEncoder, gaussian_mmd
-from astra_data.grounding.encoder import HistoryEncoder, PositionFeatures, mlp
+from astra_data.grounding.encoder import HistoryEncoder, PositionFeatures, check_encoder, mlp
 from astra_data.grounding.files import load_grounding, load_target_encoder, save_grounding, save_target_encoder
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.model import GroundingModel, GroundingShape
@@ -32,13 +34,35 @@ def test_step_by_step_is_the_whole_sequence(kind: str) -> None:
     torch.manual_seed(0)
     made = {"gru": HistoryEncoder, "transformer": user_object(TRANSFORMER)}[kind]
     encoder, inputs = made(5, embedding_size=16, latent_size=32), torch.randn(3, 20, 5)
-    latents, memories = encoder.sequence(inputs)
-    memory = encoder.initial(3)
-    for step in range(20):
-        memory = encoder.step(inputs[:, step], memory)
-        torch.testing.assert_close(memory, memories[:, step])
-        torch.testing.assert_close(encoder.latent(memory), latents[:, step])
-    torch.testing.assert_close(encoder.sequence(inputs[:, :7])[0], latents[:, :7])
+    check_encoder(encoder, inputs)
+    assert encoder.training
+
+
+@pytest.mark.parametrize(
+    ("sequence", "told"),
+    [
+        (
+            lambda latents, memories: (1.01 * latents, memories),
+            "sequence gives latents up to 0.0[0-9]+ from those of s",
+        ),
+        (lambda latents, memories: (latents, memories + 0.01), "sequence gives memories up to 0.01 from those of step"),
+        (
+            lambda latents, memories: (latents[:, :, :9], memories),
+            r"latents of shape \(3, 4, 9\), by step \(3, 4, 32\)",
+        ),
+        (
+            lambda latents, memories: latents,
+            r"^HistoryEncoder, on inputs of shape \(3, 4, 5\), fails with V",
+        ),
+    ],
+)
+def test_an_encoder_whose_sequence_is_not_its_steps_is_refused(
+    encoder: HistoryEncoder, sequence: Any, told: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usual = encoder.sequence
+    monkeypatch.setattr(encoder, "sequence", lambda inputs: sequence(*usual(inputs)))
+    with pytest.raises(BadInputError, match=told):
+        check_encoder(encoder, torch.randn(3, 4, 5))
 
 
 @pytest.mark.usefixtures("forgotten_methods")
