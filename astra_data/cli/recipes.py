@@ -219,26 +219,25 @@ def select(
     if trials is None and (by_hand or field is not None or percent is not None):
         raise BadInputError("--by-hand, --field and --percent need --trials: add --trials, or leave them out")
     from astra_data.pipeline.display import shown
-    from astra_data.pipeline.selecting import check_trials, choose_by_trials
+    from astra_data.pipeline.selecting import choose_by_trials
     from astra_data.pipeline.selecting import select as rank
     from astra_data.reports.choice import FOLDER
 
     given: dict[str, Any] = {"rows": row or (), "judge": judge, "episodes": episodes}
     tried: dict[str, Any] = {"field": field, "percent": percent}
-    if trials is not None:
-        check_trials(run, trials, by_hand=by_hand, **tried)
-    with shown("select") as progress:
-        if trials is not None and not by_hand:
+    if trials is not None and by_hand:  # a display would hide what a person is asked
+        echo = lambda _, note: typer.echo(note, err=True)  # noqa: E731
+        lines = [_chosen(choose_by_trials(run, trials, by_hand=_key, progress=echo, **tried, **given))]
+    elif trials is not None:
+        with shown("select") as progress:
             lines = [_chosen(choose_by_trials(run, trials, progress=progress, **tried, **given))]
-        else:
+    else:
+        with shown("select") as progress:
             judged, lines = rank(run, progress=progress, **given), []
             for size in judged.percents:
                 first, at = judged.ranked(size)[0], f" at {size} %" if size else ""
                 reached = f"{first.lower:.2f} in the lower quartile of its judges"
                 lines.append(f"chosen{at}: {first.row}, seed {first.seed}: {reached}")
-    if trials is not None and by_hand:
-        given["progress"] = lambda _, note: typer.echo(note, err=True)
-        lines = [_chosen(choose_by_trials(run, trials, by_hand=_key, **tried, **given))]
     typer.echo("\n".join([*lines, f"written: {run / FOLDER / 'select.md'}"]))
 
 

@@ -192,7 +192,6 @@ def _optimize(model: "GroundingModel", weights: "LossWeights", fitting: Fitting)
     descent.finish()
     return {
         "stopwatch": descent.stopwatch,
-        "parameters": sum(parameter.numel() for parameter in descent.parameters),
         "window": window,
         "updates": descent.best,
         "epochs": descent.points,

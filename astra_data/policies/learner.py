@@ -157,22 +157,22 @@ class Learner(ABC):
 
 Points = Sequence[Mapping[str, float | None]]
 
-_RECENT = 5  # points of the learning curve over which success is averaged
+_RECENT = 5  # points of the learning curve over which figures are averaged
 _NEARLY_ALWAYS = 0.95  # success of training episodes from which on little is left to learn
 _FAST = 6.0  # pace of a training then
 _GROWTH_SHARE = 0.25  # share of the training over which penalties grow; from the start, they teach robots to stand
 _PATIENCE_SHARE = 0.4  # share of the training after which they wait for no more than a mastered simulator
 
 
-def recent_success(points: Points) -> float:
-    """Return the mean success of the last training episodes; 0 if none has ended."""
-    recent = [success for point in points[-_RECENT:] if (success := point.get("success")) is not None]
-    return fmean(recent) if recent else 0.0
+def recent(points: Points, figure: str = "success") -> float | None:
+    """Return the mean of a `figure` of the last training episodes; None if none has ended."""
+    known = [value for point in points[-_RECENT:] if (value := point.get(figure)) is not None]
+    return fmean(known) if known else None
 
 
 def pace(points: Points, penalties: float) -> float:
     """Return how fast to go on after `points`: faster where little is left to learn, with all penalties."""
-    return _FAST if penalties == 1.0 and recent_success(points) >= _NEARLY_ALWAYS else 1.0
+    return _FAST if penalties == 1.0 and (recent(points) or 0.0) >= _NEARLY_ALWAYS else 1.0
 
 
 def penalty_scale(points: Points, mastered: float) -> float:
@@ -185,14 +185,13 @@ def penalty_scale(points: Points, mastered: float) -> float:
         now = float(point["share"] or 0.0)
         change = (now - before) / _GROWTH_SHARE
         needed = _NEARLY_ALWAYS if now < _PATIENCE_SHARE else mastered
-        scale += change if recent_success(points[max(0, number - _RECENT) : number]) >= needed else -change
+        scale += change if (recent(points[max(0, number - _RECENT) : number]) or 0.0) >= needed else -change
         scale, before = min(1.0, max(0.0, scale)), now
     return scale
 
 
 def lately(points: Points, figure: str) -> str:
     """Return a note of the mean of a `figure`, "success" or "episode_steps", over the last `points`."""
-    recent = [value for point in points[-10:] if (value := point.get(figure)) is not None]
-    if figure == "success":
-        return f"success of training episodes {f'{fmean(recent):.2f}' if recent else 'unknown yet'}"
-    return f"steps of training episodes {f'{fmean(recent):,.0f}' if recent else 'unknown yet'}"
+    name, digits = ("success", ".2f") if figure == "success" else ("steps", ",.0f")
+    mean = recent(points, figure)
+    return f"{name} of training episodes {'unknown yet' if mean is None else format(mean, digits)}"

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
-from quick_runs import fit_quickly
-from small_run import GROUND, TASK, TRAIN, short_task
+from small_run import small_run
 
 from astra_data.core.artifact import read_manifest
 from astra_data.core.durable import file_digest
@@ -19,10 +18,6 @@ from astra_data.deployment.folder import deploy, describe, page
 from astra_data.deployment.graph import load_onnx
 from astra_data.grounding.alignment import TargetEncoder
 from astra_data.grounding.model import GroundingModel, GroundingShape
-from astra_data.pipeline.stages.collect import CollectConfig, collect
-from astra_data.pipeline.stages.ground import ground
-from astra_data.pipeline.stages.pair import pair
-from astra_data.pipeline.stages.train import train
 from astra_data.pipeline.trained_policy import load_policy
 from astra_data.policies.networks import ActorCritic, PolicyShape, SoftActor
 from astra_data.policies.running_policy import PolicyFile, RunningPolicy
@@ -31,24 +26,15 @@ from astra_data.robots.registry import TASKS
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the folder of a run with a policy of NAS, which has the source encoder."""
-    folder = tmp_path_factory.mktemp("runs") / "small"
-    with short_task(), pytest.MonkeyPatch.context() as patch:
-        fit_quickly(patch)
-        config = CollectConfig(episodes=4, max_steps=20)
-        walks = collect(TASK, config, out=folder / "collect/seed_0")
-        pairs = pair(TASK, dataset=walks, out=folder / "pair/seed_0")
-        grounding = folder / "ground/nas/seed_0"
-        few = GROUND.model_copy(update={"updates": 2})
-        ground(TASK, "nas", few, dataset=pairs, out=grounding)
-        train(TASK, "nas", TRAIN, dataset=pairs, grounding=grounding, out=folder / "train/nas/seed_0")
-    (folder / "recipe.json").write_text(json.dumps({"task": "antmaze-umaze"}))
-    return folder
+    """Return the folder of a run with a policy of ASTRA, which has the source encoder."""
+    run = Path(shutil.copytree(small_run(tmp_path_factory), tmp_path_factory.mktemp("runs") / "small"))
+    (run / "recipe.json").write_text(json.dumps({"task": "antmaze-umaze", "evaluate": {"encoder": "source"}}))
+    return run
 
 
 @pytest.fixture(scope="module")
 def folder(run: Path) -> Path:
-    return deploy(run, "nas", run.with_name("policy"))
+    return deploy(run, "astra", run.with_name("policy"))
 
 
 def test_the_folder_tells_all_that_is_needed_to_run_it(folder: Path, run: Path) -> None:
@@ -57,7 +43,7 @@ def test_the_folder_tells_all_that_is_needed_to_run_it(folder: Path, run: Path) 
     assert names == of_lerobot | {"policy.onnx", "policy.json", "README.md", "run_policy.py", "manifest.json"}
     about = json.loads((folder / "policy.json").read_text())
     task = TASKS["antmaze-umaze"]
-    assert about["rate_hz"] == 20 and about["row"] == "nas" and about["encoder"] == "source"
+    assert about["rate_hz"] == 20 and about["row"] == "astra" and about["encoder"] == "source"
     assert tuple(about["state"]["names"]) == task.state.names and len(about["state"]["units"]) == 29
     assert len(about["goal"]["names"]) == 2
     assert about["command"]["least"] == [-1, -1] and about["command"]["largest"] == [1, 1]
@@ -94,7 +80,7 @@ def test_it_runs_without_this_package_and_without_torch(folder: Path, run: Path,
         "states = numpy.load('../states.npy')\npolicy.act(states[3], [0, 0])\npolicy.start()\n"
         f"print(json.dumps([policy.act(state, {goal}).tolist() for state in states]))\n",
     )
-    here = load_policy(run, "nas")
+    here = load_policy(run, "astra")
     here.start(1)
     expected = [here.act(torch.from_numpy(state[None]), torch.tensor([goal]))[0] for state in states]
     np.testing.assert_allclose(json.loads(shown), torch.stack(expected), atol=1e-5, rtol=0)
@@ -116,11 +102,11 @@ def recorded(run: Path) -> NDArray[np.float32]:
 def test_what_is_no_policy_and_a_folder_that_exists_are_refused(run: Path, tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="follower has no trained policy"):
         deploy(run, "follower", tmp_path / "a/policy")
-    with pytest.raises(BadInputError, match=r"nas, seed 1: expected .*\(astra-data train\).*run the recipe"):
-        deploy(run, "nas", tmp_path / "a/policy", seed=1)
+    with pytest.raises(BadInputError, match=r"astra, seed 1: expected .*\(astra-data train\).*run the recipe"):
+        deploy(run, "astra", tmp_path / "a/policy", seed=1)
     assert not (tmp_path / "a").exists()
     with pytest.raises(BadInputError, match=r"exists already; delete it or choose another folder"):
-        deploy(run, "nas", tmp_path)
+        deploy(run, "astra", tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -133,7 +119,7 @@ def test_of_a_policy_that_cannot_be_written_nothing_is_left(
 
     monkeypatch.setattr("astra_data.deployment.graph.write_graph", fail)
     with pytest.raises(BadInputError, match="cannot be traced"):
-        deploy(run, "nas", tmp_path / "policy")
+        deploy(run, "astra", tmp_path / "policy")
     assert list(tmp_path.iterdir()) == []
 
 

@@ -1,6 +1,5 @@
 """Two small runs, of the ant and of a cart's logs, each made once by all processes of the tests."""
 
-import json
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -8,16 +7,11 @@ from pathlib import Path
 import pytest
 from quick_runs import fit_quickly, run_here, small_tables
 from shared_runs import shared
-from small_run import ALIGN, COLLECT, GROUND, TASK, TRAIN, short_task
+from small_run import TASK, short_task, small_run
 
 from astra_data.core.artifact import write_manifest
 from astra_data.core.checkpoint import load_tensors, save_tensors
 from astra_data.io.importing import import_dataset
-from astra_data.pipeline.stages.align import align
-from astra_data.pipeline.stages.collect import collect
-from astra_data.pipeline.stages.ground import ground
-from astra_data.pipeline.stages.pair import pair
-from astra_data.pipeline.stages.train import train
 from astra_data.worlds.user_code import user_object
 
 
@@ -27,26 +21,10 @@ def task() -> Iterator[str]:
         yield TASK
 
 
-def make(folder: Path) -> None:
-    """Make ASTRA's artifacts of seed 0, and a policy of each of two rows."""
-    pairs, grounding = folder / "pair/seed_0", folder / "ground/astra/seed_0"
-    with short_task(), pytest.MonkeyPatch.context() as patch:
-        fit_quickly(patch)
-        walks = collect(TASK, COLLECT, out=folder / "collect/seed_0")
-        pair(TASK, dataset=walks, out=pairs)
-        ground(TASK, "astra", GROUND, dataset=pairs, out=grounding)
-        align(ALIGN, dataset=pairs, grounding=grounding, out=folder / "align/astra/seed_0")
-        for row in ("astra", "astra_plus"):
-            out = folder / "train" / row / "seed_0"
-            train(TASK, row, TRAIN, dataset=pairs, grounding=grounding, out=out)
-    settings = {"task": "antmaze-umaze", "evaluate": {"encoder": "target"}}  # though few updates fit it badly
-    (folder / "recipe.json").write_text(json.dumps(settings))
-
-
 @pytest.fixture(scope="session")
 def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of the run."""
-    return shared(tmp_path_factory, "small", make)
+    return small_run(tmp_path_factory)
 
 
 @pytest.fixture(scope="session")

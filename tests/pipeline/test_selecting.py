@@ -16,14 +16,9 @@ from astra_data.pipeline.selecting import select
 pytestmark = pytest.mark.usefixtures("quick_fits")
 
 
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return rail_run(tmp_path_factory, seeds=[0, 1, 2], methods=["direct_transfer", "nas"])
-
-
 @pytest.fixture
-def folder(made: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(made, tmp_path / "rail"))
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return rail_run(tmp_path_factory, seeds=[0, 1, 2], methods=["direct_transfer", "nas"])
 
 
 def test_the_command_is_a_door_to_the_stage(folder: Path) -> None:

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 import torch
-from small_run import ALIGN
+from small_run import ALIGN, TASK
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import STATE
@@ -156,7 +156,7 @@ def test_what_is_no_run_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_policy_aligned_with_inputs_runs_by_them_and_is_not_deployed_as_a_folder(
-    run: Path, paired: Path, grounded: Path, tmp_path: Path
+    run: Path, task: str, paired: Path, grounded: Path, tmp_path: Path
 ) -> None:
     folder = Path(shutil.copytree(run, tmp_path / "run"))
     shutil.rmtree(folder / "align")
@@ -189,4 +189,4 @@ def evaluate_with(run: Path, encoder: Any, out: Path) -> None:
     config = EvaluateConfig(episodes=1, encoder=encoder)
     parts = {"policy": "train", "grounding": "ground", "target_encoder": "align"}
     folders: dict[str, Any] = {name: run / stage / "astra/seed_0" for name, stage in parts.items()}
-    evaluate("antmaze-umaze", "astra", config, **folders, out=out)
+    evaluate(TASK, "astra", config, **folders, out=out)

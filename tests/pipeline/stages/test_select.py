@@ -20,14 +20,9 @@ pytestmark = pytest.mark.usefixtures("quick_fits")
 ROWS, SEEDS = ("direct_transfer", "nas"), (0, 1, 2)
 
 
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return rail_run(tmp_path_factory, seeds=[0, 1, 2], methods=["direct_transfer", "nas"])
-
-
 @pytest.fixture
-def root(made: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(made, tmp_path / "rail"))
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return rail_run(tmp_path_factory, seeds=[0, 1, 2], methods=["direct_transfer", "nas"])
 
 
 def reported(root: Path, **changes: Any) -> Reported:
