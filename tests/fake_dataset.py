@@ -77,9 +77,9 @@ def writer(root: Path, **changes: Any) -> DatasetWriter:
     return DatasetWriter(root, **{**SETTINGS, **changes})
 
 
-def write_fake(root: Path, **changes: Any) -> Dataset:
+def write_fake(root: Path, episodes: Iterable[keys.Episode] | None = None, **changes: Any) -> Dataset:
     with writer(root, **changes) as open_writer:
-        for episode in fake_episodes():
+        for episode in fake_episodes() if episodes is None else episodes:
             open_writer.add(episode)
     return Dataset.open(root)
 

@@ -57,15 +57,5 @@ def toy_episodes(
 
 
 def no_episodes() -> PairedEpisodes:
-    empty = torch.zeros(1, 1)
-    return PairedEpisodes(
-        target_state=empty,
-        reward=empty,
-        terminated=empty.bool(),
-        windows=PairedWindows(*[empty] * 11),
-        reference="toy@data-1.0.0",
-        content_hash="abc",
-        has_rewards=True,
-        uids=torch.arange(1),
-        recordings=torch.arange(1),
-    )
+    nothing = torch.zeros(1, 1, 1)
+    return toy_episodes(nothing, nothing, next_state=nothing)

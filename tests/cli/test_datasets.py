@@ -231,11 +231,9 @@ def test_lineage_and_differences_are_shown(tmp_path: Path) -> None:
 
 
 def test_values_are_told_from_metadata(tmp_path: Path) -> None:
-    first, second = write_fake(tmp_path / "first"), tmp_path / "second"
-    with writer(second) as open_writer:
-        for episode in fake_episodes():
-            open_writer.add(replace(episode, metadata={**episode.metadata, "source": "log.csv"}))
-    told = output_of("log", str(first.root), str(second)).splitlines()
+    episodes = (replace(one, metadata={**one.metadata, "source": "log.csv"}) for one in fake_episodes())
+    first, second = write_fake(tmp_path / "first"), write_fake(tmp_path / "second", episodes)
+    told = output_of("log", str(first.root), str(second.root)).splitlines()
     assert told[2:] == [
         "0 episodes differ in values",
         "5 episodes differ in metadata: source (0, 4, 6, 13, 9007199254740993)",

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import lerobot_recordings
 import pytest
-from fake_dataset import NAMES, fake_columns, write_fake, writer
+from fake_dataset import NAMES, fake_columns, write_fake
 from shared_runs import shared
 
 from astra_data.dataset import parquet
@@ -56,10 +56,9 @@ def frames(fake: Dataset) -> Frames:
 def record(folder: Path) -> None:
     """Write the datasets `a` and `b`, and in one process what `lerobot_recordings` makes."""
     write_fake(folder / "a")
-    with writer(folder / "b") as open_writer:
-        for uid, length in ((13, 5), (7, 4)):
-            facts = {"success": False, "return": -1.0, "source_episode": 13}
-            open_writer.add(Episode(uid, fake_columns(length, seed=uid + 100), facts))
+    facts: dict[str, float | int | bool | str] = {"success": False, "return": -1.0, "source_episode": 13}
+    lengths = {13: 5, 7: 4}
+    write_fake(folder / "b", (Episode(u, fake_columns(lengths[u], seed=u + 100), facts) for u in lengths))
     settings = {"HF_HUB_OFFLINE": "1", "HF_HOME": str(folder / "cache"), "OMP_NUM_THREADS": "1"}
     names = [str(folder), str(folder / "a"), str(folder / "b")]
     command = [sys.executable, lerobot_recordings.__file__, *names]

@@ -48,9 +48,7 @@ def test_every_kind_of_difference_is_told(fake: Dataset, tmp_path: Path) -> None
 def test_long_lists_of_the_provenance_are_counted(tmp_path: Path) -> None:
     def made(name: str, recordings: list[str]) -> Dataset:
         description = dict(DESCRIPTION) | {"config": {"recordings": recordings}}
-        with writer(tmp_path / name, description=description) as open_writer:
-            open_writer.add(fake_episode(4, 1))
-        return Dataset.open(tmp_path / name)
+        return write_fake(tmp_path / name, [fake_episode(4, 1)], description=description)
 
     logs = [f"{number}.csv" for number in range(60)]
     long = made("long", logs)
@@ -104,10 +102,9 @@ def test_an_ancestor_is_known_by_its_hash(tmp_path: Path) -> None:
 def test_copies_are_counted_as_the_recording_that_they_are_of(tmp_path: Path) -> None:
     sources = {3: None, 8: 3, 5: 8, 9: 7, 7: None}  # 5 is a copy of a part of 3
     columns = fake_episode(0, 3).columns
-    with writer(tmp_path / "set") as open_writer:
-        for uid, source in sources.items():
-            open_writer.add(Episode(uid, columns, {} if source is None else {"source_episode": source}))
-    assert Dataset.open(tmp_path / "set").recordings.tolist() == [0, 0, 0, 1, 1]
+    facts = {uid: {} if source is None else {"source_episode": source} for uid, source in sources.items()}
+    copies = write_fake(tmp_path / "set", (Episode(uid, columns, of) for uid, of in facts.items()))
+    assert copies.recordings.tolist() == [0, 0, 0, 1, 1]
     assert write_fake(tmp_path / "plain").recordings.tolist() == [0, 1, 2, 3, 4]
 
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fake_dataset import COLUMNS, DESCRIPTION, assert_same, fake_episode, writer
+from fake_dataset import COLUMNS, DESCRIPTION, assert_same, fake_episode, write_fake, writer
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import REWARD, STATE, Column, Episode
@@ -13,10 +13,7 @@ from astra_data.dataset.reader import Dataset
 
 
 def write(root: Path, uids: range) -> Dataset:
-    with writer(root) as open_writer:
-        for uid in uids:
-            open_writer.add(fake_episode(uid, 2 + uid % 5))
-    return Dataset.open(root)
+    return write_fake(root, (fake_episode(uid, 2 + uid % 5) for uid in uids))
 
 
 @pytest.fixture(scope="module")
@@ -58,11 +55,10 @@ def test_a_subset_of_a_subset_is_the_subset(forty: Dataset, tmp_path: Path) -> N
 
 
 def test_copies_of_a_recording_go_together(tmp_path: Path) -> None:
-    with writer(tmp_path / "copies") as open_writer:
-        for uid in range(60):  # ten recordings, of each of which there are five copies
-            facts = {"source_episode": uid % 10} if uid >= 10 else {}
-            open_writer.add(replace(fake_episode(uid, 3), metadata=facts))
-    source, taken = Dataset.open(tmp_path / "copies"), set[int]()
+    # Ten recordings, of each of which there are five copies.
+    facts = [{"source_episode": uid % 10} if uid >= 10 else {} for uid in range(60)]
+    copies = (replace(fake_episode(uid, 3), metadata=of) for uid, of in enumerate(facts))
+    source, taken = write_fake(tmp_path / "copies", copies), set[int]()
     for episodes in (1, 14, 18, 36):
         found = uids(subset(source, episodes=episodes, out=tmp_path / f"{episodes}"))
         assert taken < found and len({uid % 10 for uid in found}) == -(-episodes // 6)
@@ -132,18 +128,17 @@ def test_filters_that_cannot_work_are_refused(forty: Dataset, tmp_path: Path) ->
         filter_episodes(forty, min_length=100, out=tmp_path / "set")
     with pytest.raises(BadInputError, match="expected numbers, got nan"):
         filter_episodes(forty, max_return=float("nan"), out=tmp_path / "set")
-    columns = fake_episode(1, 3).columns
-    with writer(tmp_path / "bare", columns=[column for column in COLUMNS if column.name != REWARD]) as open_writer:
-        open_writer.add(Episode(1, {name: values for name, values in columns.items() if name != REWARD}))
+    unpaid = Episode(1, {name: values for name, values in fake_episode(1, 3).columns.items() if name != REWARD})
+    bare = write_fake(tmp_path / "bare", [unpaid], columns=[column for column in COLUMNS if column.name != REWARD])
     with pytest.raises(BadInputError, match="have no 'return': run `astra-data label --task`"):
-        filter_episodes(Dataset.open(tmp_path / "bare"), min_return=0, out=tmp_path / "set")
+        filter_episodes(bare, min_return=0, out=tmp_path / "set")
 
 
 def test_returns_that_are_not_told_are_sums_of_rewards(tmp_path: Path) -> None:
-    with writer(tmp_path / "bare") as open_writer:
-        for uid, steps in ((3, 2), (1, 4), (2, 3)):
-            open_writer.add(Episode(uid, {**fake_episode(uid, steps).columns, REWARD: np.ones(steps, np.float32)}))
-    bare = Dataset.open(tmp_path / "bare")
+    episodes = [Episode(uid, fake_episode(uid, steps).columns) for uid, steps in ((3, 2), (1, 4), (2, 3))]
+    for episode in episodes:
+        episode.columns[REWARD][:] = 1.0
+    bare = write_fake(tmp_path / "bare", episodes)
     assert uids(filter_episodes(bare, min_return=3, out=tmp_path / "set")) == {1, 2}
     assert uids(filter_episodes(bare, max_return=2, out=tmp_path / "low")) == {3}
 
@@ -188,9 +183,7 @@ def test_datasets_of_different_worlds_are_not_merged(tmp_path: Path, world: str)
     parts = []
     for maze, uid in (("umaze", 1), ("long", 2)):
         described = {**DESCRIPTION, world: {"id": f"antmaze-{maze}", "timestep_s": 0.1}}
-        with writer(tmp_path / maze, description=described) as open_writer:
-            open_writer.add(fake_episode(uid, 3))
-        parts.append(Dataset.open(tmp_path / maze))
+        parts.append(write_fake(tmp_path / maze, [fake_episode(uid, 3)], description=described))
     fault = rf"fake@data-1\.0\.0: {world}\.id: 'antmaze-umaze', then 'antmaze-long'"
     with pytest.raises(BadInputError, match=fault):
         merge(parts, out=tmp_path / "all")
@@ -215,11 +208,8 @@ def test_datasets_that_differ_are_told_apart(fake: Dataset, tmp_path: Path) -> N
 
 
 def test_datasets_of_different_tasks_are_merged(tmp_path: Path) -> None:
-    parts = []
-    for uid, task in enumerate(("run", "walk", "run", "stand")):
-        with writer(tmp_path / str(uid), task=task) as open_writer:
-            open_writer.add(fake_episode(uid, 3))
-        parts.append(Dataset.open(tmp_path / str(uid)))
+    tasks = enumerate(("run", "walk", "run", "stand"))
+    parts = [write_fake(tmp_path / str(uid), [fake_episode(uid, 3)], task=task) for uid, task in tasks]
     same = Dataset.open(merge([parts[0], parts[2]], out=tmp_path / "same"))
     assert (same.task, "task" in same.metadata) == ("run", False)
     two = Dataset.open(merge([parts[1], same], out=tmp_path / "two"))

@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from damaged import DATA, alter
-from fake_dataset import COLUMNS, LENGTHS, assert_same, concatenated, fake_columns, fake_episodes, write_fake, writer
+from fake_dataset import COLUMNS, LENGTHS, assert_same, concatenated, fake_columns, fake_episodes, write_fake
 
 from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.dataset import Dataset, parquet
@@ -80,10 +80,7 @@ def test_subsets_are_nested_and_follow_the_uid(fake: Dataset, tmp_path: Path) ->
     subsets = [fake.subset(count) for count in range(1, 6)]
     assert all(small == large[: len(small)] for small, large in itertools.pairwise(subsets))
     assert sorted(subsets[-1]) == [0, 1, 2, 3, 4]
-    with writer(tmp_path / "reversed") as open_writer:
-        for episode in fake_episodes()[::-1]:
-            open_writer.add(episode)
-    other = Dataset.open(tmp_path / "reversed")
+    other = write_fake(tmp_path / "reversed", fake_episodes()[::-1])
     assert other.uids[other.subset(3)].tolist() == fake.uids[fake.subset(3)].tolist()
     assert write_fake(tmp_path / "seeded", subset_seed=1).subset(5) != fake.subset(5)
     with pytest.raises(BadInputError, match="a subset of 6 episodes, expected 1 to 5"):
@@ -94,12 +91,10 @@ def test_subsets_are_nested_and_follow_the_uid(fake: Dataset, tmp_path: Path) ->
 
 def test_success_is_taken_from_the_metadata_or_else_from_the_column(tmp_path: Path) -> None:
     def successes(name: str, *metadata: dict[str, bool | str]) -> list[bool | None] | None:
-        with writer(tmp_path / name) as open_writer:
-            for uid, facts in enumerate(metadata):  # in the column, those of odd uids succeed
-                columns = fake_columns(3, seed=uid)
-                columns[SUCCESS] = np.array([False, bool(uid % 2), False])
-                open_writer.add(Episode(uid, columns, facts))
-        return Dataset.open(tmp_path / name).successes()
+        episodes = [Episode(uid, fake_columns(3, seed=uid), facts) for uid, facts in enumerate(metadata)]
+        for episode in episodes:  # in the column, those of odd uids succeed
+            episode.columns[SUCCESS][:] = [False, bool(episode.uid % 2), False]
+        return write_fake(tmp_path / name, episodes).successes()
 
     assert successes("metadata", {"success": True}, {"success": False}) == [True, False]
     assert successes("column", {}, {}) == [False, True] and successes("some", {"success": True}, {}) == [False, True]
@@ -151,11 +146,8 @@ def test_the_content_hash_sees_values_only(fake: Dataset, tmp_path: Path) -> Non
     assert renamed.content_hash == fake.content_hash
     columns = fake_columns(7, seed=13)
     columns[STATE][3, 0] = np.nextafter(columns[STATE][3, 0], np.float32(9))
-    with writer(tmp_path / "three") as open_writer:
-        open_writer.add(Episode(13, columns))
-        for episode in fake_episodes()[1:]:
-            open_writer.add(episode)
-    assert Dataset.open(tmp_path / "three").content_hash != fake.content_hash
+    other = write_fake(tmp_path / "three", [Episode(13, columns), *fake_episodes()[1:]])
+    assert other.content_hash != fake.content_hash
 
 
 def test_reading_needs_no_heavy_package(fake: Dataset) -> None:

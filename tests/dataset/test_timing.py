@@ -3,7 +3,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fake_dataset import LENGTHS, fake_episode, writer
+from fake_dataset import LENGTHS, fake_episode, write_fake, writer
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import (
@@ -82,10 +82,10 @@ def test_steps_of_a_condition_go_and_what_is_left_are_episodes(tmp_path: Path) -
 
 def test_still_ends_go_and_pauses_stay(tmp_path: Path) -> None:
     x = np.array([0, 0, 0, 1, 1, 2, 2, 2], np.float32)
-    with writer(tmp_path / "logs", columns=[Column(STATE), Column(NEXT_STATE)]) as open_writer:
-        open_writer.add(Episode(0, {STATE: x[:-1], NEXT_STATE: x[1:]}))
-        open_writer.add(Episode(1, {STATE: np.zeros(3, np.float32), NEXT_STATE: np.zeros(3, np.float32)}))
-    (found,) = made(trim(Dataset.open(tmp_path / "logs"), still=True, out=tmp_path / "out"))
+    parts = (x[:-1], x[1:]), (np.zeros(3, np.float32),) * 2
+    episodes = (Episode(uid, {STATE: now, NEXT_STATE: later}) for uid, (now, later) in enumerate(parts))
+    logs = write_fake(tmp_path / "logs", episodes, columns=[Column(STATE), Column(NEXT_STATE)])
+    (found,) = made(trim(logs, still=True, out=tmp_path / "out"))
     assert found.columns[STATE].tolist() == [0, 1, 1] and found.columns[NEXT_STATE].tolist() == [1, 1, 2]
 
 
@@ -125,10 +125,9 @@ def turning(folder: Path, fps: int, steps: int) -> Dataset:
     values = {STATE: state[:-1], NEXT_STATE: state[1:], ACTION: np.arange(steps), REWARD: np.ones(steps)}
     values |= {"abstract.state": np.zeros(steps), "time": 5 + time_s[:-1]}
     flags = {TERMINATED: last, SUCCESS: last & False}
-    with writer(folder, columns=columns, fps=fps) as open_writer:
-        floats = {name: value.astype(np.float32) for name, value in values.items()}
-        open_writer.add(Episode(3, floats | flags, {"return": float(steps), "success": False}))
-    return Dataset.open(folder)
+    floats = {name: value.astype(np.float32) for name, value in values.items()}
+    episode = Episode(3, floats | flags, {"return": float(steps), "success": False})
+    return write_fake(folder, [episode], columns=columns, fps=fps)
 
 
 @pytest.mark.parametrize(("recorded", "fps", "steps"), [(62, 10, 12), (62, 25, 31), (62, 100, 124), (61, 100, 122)])
@@ -163,20 +162,20 @@ def test_rewards_and_endings_are_those_of_all_steps_within(tmp_path: Path) -> No
 
 def test_without_next_states_the_last_state_has_no_step_after_it(tmp_path: Path) -> None:
     after = ("next.observation.load", "next.mode")  # what is next is after the longer step
-    with writer(tmp_path / "logs", columns=[Column(STATE), *map(Column, after)], fps=10) as open_writer:
-        time = np.arange(6, dtype=np.float32)
-        open_writer.add(Episode(0, {STATE: time} | dict.fromkeys(after, time + 1)))
-    (episode,) = made(resample(Dataset.open(tmp_path / "logs"), 5, out=tmp_path / "out"))
+    time = np.arange(6, dtype=np.float32)
+    recorded = Episode(0, {STATE: time} | dict.fromkeys(after, time + 1))
+    logs = write_fake(tmp_path / "logs", [recorded], columns=[Column(STATE), *map(Column, after)], fps=10)
+    (episode,) = made(resample(logs, 5, out=tmp_path / "out"))
     assert episode.columns[STATE].tolist() == [0, 2, 4]
     assert [episode.columns[name].tolist() for name in after] == [[2, 4, 6]] * 2
 
 
 def test_angles_that_are_counted_go_on(tmp_path: Path) -> None:
     columns = [Column(name, astra={"unit": ["rad"]}) for name in (STATE, NEXT_STATE)]
-    with writer(tmp_path / "logs", columns=columns, fps=10) as open_writer:
-        for uid, angles in enumerate(np.split(4 * np.arange(9, dtype=np.float32), [2])):
-            open_writer.add(Episode(uid, {STATE: angles, NEXT_STATE: angles + 4}))
-    for episode in made(resample(Dataset.open(tmp_path / "logs"), 20, out=tmp_path / "out")):
+    parts = enumerate(np.split(4 * np.arange(9, dtype=np.float32), [2]))
+    turns = (Episode(uid, {STATE: angles, NEXT_STATE: angles + 4}) for uid, angles in parts)
+    logs = write_fake(tmp_path / "logs", turns, columns=columns, fps=10)
+    for episode in made(resample(logs, 20, out=tmp_path / "out")):
         first = 8 * episode.uid
         assert episode.columns[STATE].tolist() == [*range(first, first + 2 * len(episode), 2)]
 

@@ -37,7 +37,7 @@ def test_a_history_model_comes_back_frozen(tmp_path: Path) -> None:
         assert float(loaded.failure_cost) == float(model.failure_cost) < -5.0
     tensors, metadata = load_tensors(path)
     assert tensors.keys() == model.state_dict().keys()
-    assert (metadata["kind"], metadata["dataset"], metadata["hash"]) == ("history", "toy@data-1.0.0", "abc")
+    assert (metadata["kind"], metadata["dataset"], metadata["hash"]) == ("history", "toy@data-1.0.0", "0")
 
 
 def test_a_grounding_of_the_users_own_is_read_once_it_is_known(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -25,19 +25,9 @@ def lagging_world(episodes: int, steps: int, seed: int) -> PairedWindows:
         simulated[:, step] = state[:, step] + 0.1 * action[:, step]
         state[:, step + 1] = simulated[:, step] + 0.2 * drag
         drag = 0.7 * drag + 0.3 * action[:, step]
-    return PairedWindows(
-        state=state[:, :-1],
-        action=action,
-        previous_action=torch.cat([torch.zeros(episodes, 1, 2), action[:, :-1]], dim=1),
-        goal=torch.zeros(episodes, steps, 2),
-        simulated_next=simulated,
-        next_state=state[:, 1:],
-        reward=state[:, 1:].norm(dim=-1),
-        goes_on=torch.ones(episodes, steps),
-        failed=torch.zeros(episodes, steps),
-        fails_soon=torch.zeros(episodes, steps),
-        mask=torch.ones(episodes, steps),
-    )
+    after = state[:, 1:]
+    paid = after.norm(dim=-1)
+    return toy_episodes(state[:, :-1], action, next_state=after, simulated_next=simulated, reward=paid).windows
 
 
 TRAINING, HELD_OUT = lagging_world(32, 30, seed=0), lagging_world(64, 30, seed=1)

@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from damaged import DATA, EPISODES, alter, declare, drop, edit, retype, truncate, write
-from fake_dataset import COLUMNS, concatenated, fake_columns, fake_episodes, writer
+from fake_dataset import COLUMNS, concatenated, fake_columns, fake_episodes, write_fake, writer
 
 from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.dataset import Dataset
@@ -131,10 +131,7 @@ def test_the_policy_that_acted_is_compared_with_what_was_recorded_of_it(tmp_path
 
 
 def test_all_faults_are_told_but_few_of_a_kind(tmp_path: Path) -> None:
-    with writer(tmp_path / "set") as open_writer:
-        for uid in range(12):
-            open_writer.add(Episode(uid, fake_columns(3, seed=uid)))
-    root = tmp_path / "set"
+    root = write_fake(tmp_path / "set", (Episode(uid, fake_columns(3, seed=uid)) for uid in range(12))).root
     table = pq.read_table(root / DATA)
     for name in ("timestamp", "frame_index"):
         at, field = table.column_names.index(name), table.schema.field(name)

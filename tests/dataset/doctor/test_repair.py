@@ -9,7 +9,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from damaged import DATA, EPISODES, alter, alter_rows, drop, edit, reseal, truncate, write
-from fake_dataset import COLUMNS, DESCRIPTION, LENGTHS, assert_same, fake_columns, fake_episodes, write_fake, writer
+from fake_dataset import COLUMNS, DESCRIPTION, LENGTHS, assert_same, fake_columns, fake_episodes, write_fake
 
 from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.dataset import Dataset
@@ -309,20 +309,6 @@ def test_columns_are_what_is_stored_whatever_info_says(
     assert name != "action" or saved.features["action"]["names"] == (feature and ["x", "y"])
 
 
-def test_altered_metadata_is_not_taken_over(tmp_path: Path) -> None:
-    root = write_fake(tmp_path / "set", subset_seed=7).root
-    alter_rows(root / METADATA_PATH, "success", {1: True})
-    uids = json.loads((root / SUBSETS_PATH).read_text())["uids"]
-    edit(SUBSETS_PATH, uids=uids[::-1])(root)
-    repaired = repair(root, out=tmp_path / "saved")
-    assert repaired.notes == [
-        f"{METADATA_PATH} was altered after it was written: success, return and the like of the episodes are lost",
-        f"{SUBSETS_PATH} was altered after it was written: the order of the subsets is that of seed 0",
-    ]
-    saved = Dataset.open(tmp_path / "saved")
-    assert (saved.metadata, saved.subset_seed) == ({}, 0)
-
-
 def test_episodes_with_other_values_than_the_original_are_left_out(fake: Dataset, tmp_path: Path) -> None:
     edited = shutil.copytree(fake.root, tmp_path / "edited", ignore=shutil.ignore_patterns("astra"))
     alter_rows(edited / DATA, REWARD, {0: 9.0})
@@ -345,10 +331,8 @@ def stored(*datasets: Dataset) -> list[tuple[int, dict[str, Array]]]:
 @pytest.fixture
 def other(tmp_path: Path) -> Dataset:
     """Two episodes; the first has a uid of the fake dataset, the second was made from it."""
-    with writer(tmp_path / "other") as open_writer:
-        open_writer.add(Episode(4, fake_columns(3, seed=50), {"floor": "carpet"}))
-        open_writer.add(Episode(99, fake_columns(3, seed=51), {"source_episode": 4}))
-    return Dataset.open(tmp_path / "other")
+    first = Episode(4, fake_columns(3, seed=50), {"floor": "carpet"})
+    return write_fake(tmp_path / "other", [first, Episode(99, fake_columns(3, seed=51), {"source_episode": 4})])
 
 
 def test_each_has_the_metadata_of_its_own_dataset(fake: Dataset, other: Dataset) -> None:
@@ -387,6 +371,7 @@ def seen(root: Path, *sources: Dataset) -> tuple[Remains, list[str]]:
     [
         (drop(SUBSETS_PATH), f"{SUBSETS_PATH} is missing: {SEED_0}", "subset_seed"),
         (write(SUBSETS_PATH, b"{"), f"{SUBSETS_PATH} {WAS}: {SEED_0}", "subset_seed"),
+        (edit(SUBSETS_PATH, seed=8), f"{SUBSETS_PATH} {WAS}: {SEED_0}", "subset_seed"),
         (drop(METADATA_PATH), f"{METADATA_PATH} is missing: {LOST}", "metadata"),
         (alter(METADATA_PATH, "return", 0, 9.0), f"{METADATA_PATH} {WAS}: {LOST}", "metadata"),
         (drop(TASKS), f"{TASKS} is missing: the task is unknown", "tasks"),
@@ -407,4 +392,6 @@ def test_what_is_missing_or_altered_is_noted(
     assert notes == [note]
     assert not lost or not getattr(found, lost)
     repair(whole.root, out=whole.root.parent / "out")
-    assert Dataset.open(whole.root.parent / "out").description["parents"] == [whole.identity]
+    saved = Dataset.open(whole.root.parent / "out")
+    assert saved.description["parents"] == [whole.identity]
+    assert saved.subset_seed == (0 if lost == "subset_seed" else 7) and bool(saved.metadata) == (lost != "metadata")

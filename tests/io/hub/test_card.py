@@ -67,9 +67,9 @@ def test_sums_are_folded_away(fake: Dataset) -> None:
 
 
 def test_without_positions_there_is_no_figure(tmp_path: Path) -> None:
-    with writer(tmp_path / "plain", columns=[COLUMNS[1]]) as out:
-        out.add(Episode(0, {ACTION: fake_episodes()[0].columns[ACTION]}))
-    assert write_card(Dataset.open(tmp_path / "plain"), tmp_path / "it.md", Notes()) == [tmp_path / "it.md"]
+    actions = Episode(0, {ACTION: fake_episodes()[0].columns[ACTION]})
+    plain = write_fake(tmp_path / "plain", [actions], columns=[COLUMNS[1]])
+    assert write_card(plain, tmp_path / "it.md", Notes()) == [tmp_path / "it.md"]
     assert "![" not in (tmp_path / "it.md").read_text()
 
 
@@ -77,10 +77,9 @@ def test_what_strangers_wrote_is_words_in_a_card(tmp_path: Path) -> None:
     bad = "x\n# Heading\n<script>alert(1)</script> | y"
     columns = [Column(ACTION, size=2, names=("<b>", "y"), meaning=bad, astra={"unit": ["<i>", "m"]})]
     description = {**DESCRIPTION, "config": {bad: "`<script>"}, "stage": bad}
-    with writer(tmp_path / "set", columns=columns, task=bad, description=description) as open_writer:
-        episode = Episode(0, {ACTION: np.zeros((3, 2), np.float32)}, {bad: True})
-        open_writer.add(episode)
-    text = re.sub(r"`[^`\n]*`", "", render_card(Dataset.open(tmp_path / "set"), NOTES))
+    episode = Episode(0, {ACTION: np.zeros((3, 2), np.float32)}, {bad: True})
+    dataset = write_fake(tmp_path / "set", [episode], columns=columns, task=bad, description=description)
+    text = re.sub(r"`[^`\n]*`", "", render_card(dataset, NOTES))
     assert "<script>" not in text and "<b>" not in text and "<i>" not in text
     assert not re.search("^# Heading", text, re.MULTILINE)
 

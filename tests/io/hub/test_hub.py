@@ -1,6 +1,7 @@
 """The Hugging Face Hub, played by a server on loopback to the real huggingface_hub."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 from fake_dataset import DESCRIPTION, write_fake
@@ -20,7 +21,7 @@ pytestmark = [
 DATA = "data/chunk-000/file-000.parquet"
 
 
-def versioned(root: Path, version: str, **changes: object) -> Dataset:
+def versioned(root: Path, version: str, **changes: Any) -> Dataset:
     return write_fake(root, description={**DESCRIPTION, "version": version}, **changes)
 
 

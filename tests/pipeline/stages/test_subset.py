@@ -3,7 +3,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fake_dataset import fake_episodes, write_fake, writer
+from fake_dataset import fake_episodes, write_fake
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.reader import Dataset
@@ -33,10 +33,8 @@ def test_how_many_there_are_of_how_many_is_told(tmp_path: Path) -> None:
 
 
 def test_episodes_that_are_marked_as_held_out_are_in_every_size_and_no_part_of_it(tmp_path: Path) -> None:
-    with writer(tmp_path / "pair") as open_writer:
-        for index, episode in enumerate(fake_episodes()):
-            open_writer.add(replace(episode, metadata={"held_out": index in (1, 3)}))
-    held_out = set(Dataset.open(tmp_path / "pair").uids[[1, 3]].tolist())
+    marked = (replace(one, metadata={"held_out": index in (1, 3)}) for index, one in enumerate(fake_episodes()))
+    held_out = set(write_fake(tmp_path / "pair", marked).uids[[1, 3]].tolist())
     notes = list[str]()
     for percent, others in ((34, 1), (100, 3)):
         out = tmp_path / str(percent)
