@@ -7,7 +7,7 @@ from pathlib import Path
 import matplotlib.image
 import pytest
 from command_line import call, output_of
-from fake_dataset import COLUMNS, DESCRIPTION, fake_episodes, write_fake, writer
+from fake_dataset import COLUMNS, DESCRIPTION, fake_episodes, write_fake
 from rich.table import Table
 from toy_logs import Columns, toy_columns, write_logs
 
@@ -171,10 +171,9 @@ def test_no_name_controls_the_terminal(
     column = replace(COLUMNS[1], name=f"x{bad}", names=(f"x{bad}", "y"), astra={"unit": [bad, "m"]})
     description: dict[str, object] = {**DESCRIPTION, "config": {bad: bad}, "stage": f"s{bad}"}
     root = tmp_path / bad / "fake/data-1.0.0"
-    with writer(root, columns=[*COLUMNS, column], task=bad, description=description) as open_writer:
-        for episode in fake_episodes():
-            columns = {**episode.columns, column.name: episode.columns["action"]}
-            open_writer.add(Episode(episode.uid, columns, {bad: 1.0}))
+    given = {one.uid: {**one.columns, column.name: one.columns["action"]} for one in fake_episodes()}
+    episodes = (Episode(uid, columns, {bad: 1.0}) for uid, columns in given.items())
+    write_fake(root, episodes, columns=[*COLUMNS, column], task=bad, description=description)
     (root / "meta" / bad).touch()
     for command in ("list", "inspect", "log", "validate"):
         monkeypatch.setattr(sys, "argv", ["astra-data", command, *(["fake"] if command != "list" else [])])

@@ -96,14 +96,6 @@ def test_a_damaged_episode_is_told(tmp_path: Path) -> None:
             pass
 
 
-def test_what_a_kill_after_the_end_left_is_cleared(tmp_path: Path) -> None:
-    interrupted(tmp_path / "set", fake_episodes())
-    write_fake(tmp_path / "set")
-    with pytest.raises(BadInputError, match="exists already; delete it"), staged_writer(tmp_path / "set"):
-        pass
-    assert leftovers(tmp_path) == []
-
-
 def test_another_dataset_in_its_place_does_not_cost_the_recording(tmp_path: Path) -> None:
     interrupted(tmp_path / "set", [*fake_episodes()[:2], fake_episode(6, 31)])
     write_fake(tmp_path / "set")

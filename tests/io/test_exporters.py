@@ -57,14 +57,13 @@ def test_one_value_a_step_is_a_vector_of_one(tmp_path: Path, format: str, caplog
     """As the other libraries expect states, goals and actions; rewards that are missing are zeros."""
     single = [Column(name) for name in (STATE, NEXT_STATE, GOAL, ACTION)]
     rest = [column for column in COLUMNS if column.name not in (STATE, ACTION, REWARD)]
-    with writer(tmp_path / "set", columns=[*single, *rest, Column("goal")]) as open_writer:
-        for number in range(2):
-            values = np.arange(6, dtype=np.float32)
-            mine = {STATE: values[:-1], NEXT_STATE: values[1:], GOAL: values[:-1], ACTION: values[:-1]}
-            others = {name: v for name, v in fake_columns(5, seed=1).items() if name != REWARD}
-            open_writer.add(Episode(number, others | mine | {"goal": np.full(5, 7, np.float32)}))
+    values = np.arange(6, dtype=np.float32)
+    mine = {STATE: values[:-1], NEXT_STATE: values[1:], GOAL: values[:-1], ACTION: values[:-1]}
+    columns = {name: v for name, v in fake_columns(5, seed=1).items() if name != REWARD} | mine
+    episodes = (Episode(number, columns | {"goal": np.full(5, 7, np.float32)}) for number in range(2))
+    source = write_fake(tmp_path / "set", episodes, columns=[*single, *rest, Column("goal")])
     out = tmp_path / FILES[format]
-    export(Dataset.open(tmp_path / "set"), out, format=format)
+    export(source, out, format=format)
     assert caplog.messages == ["fake@data-1.0.0 has no next.reward: rewards are written as 0"]
     with h5py.File(out / "data/main_data.hdf5" if format == "minari" else out) as file:
         shapes = {field: file[field].shape for field in VECTORS_OF[format]}
@@ -211,12 +210,10 @@ def test_minari_loads_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, has_go
 
 
 def test_minari_refuses_next_states_that_do_not_follow(tmp_path: Path) -> None:
-    with writer(tmp_path / "set", columns=[*COLUMNS, NEXT]) as open_writer:
-        columns = fake_columns(4, seed=1)
-        following = np.concatenate([columns[STATE][1:], columns[STATE][:1]])
-        following[-2] += 1
-        open_writer.add(Episode(1, columns | {NEXT_STATE: following}))
-    apart = Dataset.open(tmp_path / "set")
+    columns = fake_columns(4, seed=1)
+    following = np.concatenate([columns[STATE][1:], columns[STATE][:1]])
+    following[-2] += 1
+    apart = write_fake(tmp_path / "set", [Episode(1, columns | {NEXT_STATE: following})], columns=[*COLUMNS, NEXT])
     with pytest.raises(BadInputError, match="a next state is not the state of the next step"):
         export(apart, tmp_path / "random-v0", format="minari")
     for name in ("no id!", "without-version"):

@@ -7,14 +7,15 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import pytest
-from fake_dataset import COLUMNS, assert_same, fake_episodes, writer
+from fake_dataset import COLUMNS, assert_same, fake_episodes, write_fake
 
-from astra_data.dataset.columns import GOAL, Column, Episode
+from astra_data.dataset.columns import GOAL, Column
 from astra_data.dataset.doctor.check import check
 from astra_data.dataset.doctor.repair import repair
 from astra_data.dataset.reader import Dataset
@@ -34,12 +35,9 @@ class Runs(NamedTuple):
 
 def write_with_goal(root: Path) -> Dataset:
     goal = Column(GOAL, size=2, names=("x", "y"), meaning="where to go")
-    with writer(root, columns=[*COLUMNS, goal]) as open_writer:
-        for episode in fake_episodes():
-            goals = np.ones((len(episode), 2), np.float32) * [episode.uid % 7, 1]
-            columns = {**episode.columns, GOAL: goals.astype(np.float32)}
-            open_writer.add(Episode(episode.uid, columns, episode.metadata))
-    return Dataset.open(root)
+    goals = {one.uid: np.tile(np.array([one.uid % 7, 1], np.float32), (len(one), 1)) for one in fake_episodes()}
+    episodes = (replace(one, columns={**one.columns, GOAL: goals[one.uid]}) for one in fake_episodes())
+    return write_fake(root, episodes, columns=[*COLUMNS, goal])
 
 
 @pytest.fixture(scope="module")

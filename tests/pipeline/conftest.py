@@ -66,7 +66,7 @@ def make_cart(folder: Path) -> None:
     """Make a run of imported logs of the cart, up to its policies; its task has no target."""
     example = Path(__file__).parents[2] / "recipes/examples/cart"
     user_object(f"{example}/robot.py:record")(folder / "csv", drives=8, seconds=6)
-    (folder / "cart.py").write_text((example / "cart.py").read_text())
+    (folder / "cart.py").write_text((example / "cart.py").read_text().replace("horizon=150", "horizon=60"))
     import_dataset(sorted((folder / "csv").glob("*.csv")), example / "logs.toml", out=folder / "logs")
     rows = 'task = "cart.py:TASK"\ndata = "logs"\nmethods = ["direct_transfer", "nas", "astra"]\nseeds = [0]\n'
     tables = small_tables(held_out_share=0.25, episodes=3, train="data_start_share = 0.0")

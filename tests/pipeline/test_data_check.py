@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fake_dataset import writer
+from fake_dataset import write_fake
 from fake_stages import FakeStages
 from typer.testing import CliRunner
 
@@ -37,10 +37,9 @@ def write_logs(
     columns += [Column(ACTION, size=1, names=("v",))]
     states = np.zeros((9, state_size), np.float32)
     actions = np.linspace(least, largest, 9, dtype=np.float32)
-    with writer(folder, columns=columns, fps=10) as logs:
-        for uid, held in enumerate(held_out):
-            columns_of_one = {STATE: states, NEXT_STATE: states + np.float32(ahead), ACTION: actions}
-            logs.add(Episode(uid, columns_of_one, {"held_out": held, **metadata}))
+    values = {STATE: states, NEXT_STATE: states + np.float32(ahead), ACTION: actions}
+    episodes = (Episode(uid, values, {"held_out": held, **metadata}) for uid, held in enumerate(held_out))
+    write_fake(folder, episodes, columns=columns, fps=10)
 
 
 @pytest.fixture

@@ -133,11 +133,11 @@ def test_episodes_end_at_the_horizon_or_where_an_option_says(run: Path) -> None:
     env = gymnasium.make(ID, run=run, row="nas", episode_steps=2).unwrapped
     ends = [env.reset() and [env.step(np.zeros(2, dtype=np.float32))[3] for _ in range(2)] for _ in range(2)]
     assert ends == [[False, True], [False, True]]
-    assert (steps(), steps(episode_steps=7), steps(max_episode_steps=5)) == (150, 7, 5)
+    assert (steps(), steps(episode_steps=7), steps(max_episode_steps=5)) == (60, 7, 5)
     make: Callable[..., Any] = gymnasium.make_vec
     limits: list[dict[str, int]] = [{}, {"max_episode_steps": 6}, {"max_episode_steps": 400}]
     vectors = [make(ID, num_envs=3, run=run, row="nas", **more) for more in limits]
-    assert [env.max_episode_steps for env in vectors] == [150, 6, 150]
+    assert [env.max_episode_steps for env in vectors] == [60, 6, 60]
     assert all(isinstance(env, BatchedVectorEnv) for env in vectors)
 
 

@@ -1,4 +1,3 @@
-import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -8,6 +7,7 @@ from unittest.mock import Mock
 
 import pytest
 import torch
+from fake_runs import edit_json
 from rail_run import ROOT, rail_run
 from typer.testing import CliRunner
 
@@ -116,9 +116,7 @@ def test_candidates_of_a_round_meet_the_same_starts_and_goals(
 
 @pytest.mark.parametrize("encoder", ["target", "source"])
 def test_policies_are_deployed_as_they_are_evaluated(folder: Path, tries: Tries, encoder: str) -> None:
-    recipe = folder / "recipe.json"
-    settings = json.loads(recipe.read_text())
-    recipe.write_text(json.dumps(settings | {"evaluate": {"encoder": encoder, "leg_scale": 1.25}}))
+    edit_json(folder / "recipe.json", evaluate={"encoder": encoder, "leg_scale": 1.25})
     choose_by_trials(folder, 8, rows=["astra"], episodes=3)
     assert [made[0].target_encoder is not None for made in tries.made] == [encoder == "target"] * 2
     assert all(made[3]["leg_scale"] == 1.25 for made in tries.made)
@@ -170,9 +168,7 @@ def test_what_trials_cannot_be_made_of_is_refused(folder: Path, tries: Tries) ->
 
 
 def test_a_task_without_a_target_is_tried_nowhere(folder: Path) -> None:
-    recipe = folder / "recipe.json"
-    task = {"task": f"{ROOT}/tests/small_cart.py:LOGS_ALONE"}
-    recipe.write_text(json.dumps(json.loads(recipe.read_text()) | task))
+    edit_json(folder / "recipe.json", task=f"{ROOT}/tests/small_cart.py:LOGS_ALONE")
     with pytest.raises(BadInputError, match=r"expected a task with a target, got .*LOGS_ALONE: leave out"):
         choose_by_trials(folder, 12)
 
@@ -239,7 +235,7 @@ def test_a_person_makes_the_trials_and_may_stop_at_any(
 
 
 def test_trials_by_hand_are_filled_into_the_sheet(folder: Path, predicted: list[Any]) -> None:
-    recipe, sheet = folder / "recipe.json", folder / "select/trials.csv"
+    sheet = folder / "select/trials.csv"
     command = ["select", str(folder), "--trials", "4", "--by-hand", "--field", "2"]
     shown = CliRunner().invoke(app, command)  # without a terminal
     assert shown.exit_code == 0, shown.output
@@ -260,7 +256,7 @@ def test_trials_by_hand_are_filled_into_the_sheet(folder: Path, predicted: list[
     assert "chosen with 4" in CliRunner().invoke(app, command).output
     with pytest.raises(BadInputError, match="by_hand = False, found 4 made with True: use the same settings"):
         choose_by_trials(folder, 4, field=2)
-    recipe.write_text(json.dumps(json.loads(recipe.read_text()) | {"task": f"{ROOT}/tests/small_cart.py:LOGS_ALONE"}))
+    edit_json(folder / "recipe.json", task=f"{ROOT}/tests/small_cart.py:LOGS_ALONE")
     sheet.unlink()
     with pytest.raises(BadInputError, match=r"trials.csv: expected the sheet of the trials, found .*No such file"):
         choose_by_trials(folder, 4, field=2, by_hand=str)

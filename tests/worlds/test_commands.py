@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fake_dataset import COLUMNS, concatenated, fake_episode, write_fake, writer
+from fake_dataset import COLUMNS, concatenated, fake_episode, write_fake
 from small_cart import TASK, Rail
 
 from astra_data.core.errors import BadInputError
@@ -65,16 +65,14 @@ def test_the_bounds_may_be_the_range_of_a_dataset(tmp_path: Path) -> None:
 def test_a_range_that_is_none_is_refused(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="nowhere"):
         Commands.recorded(tmp_path / "nowhere")
-    with writer(tmp_path / "still") as still:
-        episode = fake_episode(1, 5)
-        episode.columns[ACTION][:, 1] = 0.5
-        still.add(episode)
+    episode = fake_episode(1, 5)
+    episode.columns[ACTION][:, 1] = 0.5
+    write_fake(tmp_path / "still", [episode])
     with pytest.raises(BadInputError, match=r"commands: y never changes in .*: give the bounds"):
         Commands.recorded(tmp_path / "still")
+    columns = {name: values for name, values in episode.columns.items() if name != ACTION}
     without = [column for column in COLUMNS if column.name != ACTION]
-    with writer(tmp_path / "none", columns=without) as none:
-        columns = {name: values for name, values in fake_episode(1, 5).columns.items() if name != ACTION}
-        none.add(replace(fake_episode(1, 5), columns=columns))
+    write_fake(tmp_path / "none", [replace(episode, columns=columns)], columns=without)
     with pytest.raises(BadInputError, match="has no column action: give their bounds"):
         Commands.recorded(tmp_path / "none")
 

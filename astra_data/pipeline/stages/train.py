@@ -100,6 +100,8 @@ def train(
         else:
             policy, curve = learn(training)
         policy.save(folder / POLICY)
+        if policy.simulation is not None:
+            curve["world"] = policy.simulation.world.model_dump()
         spent = stopwatch.spent()
         figures = made | spent | curve | {"finished_at": spent["finished_at"]}  # of the last part, whichever is kept
         (folder / CURVE).write_text(json.dumps(figures, indent=1))

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fake_dataset import COLUMNS, DESCRIPTION, concatenated, fake_episodes, write_fake, writer
+from fake_dataset import COLUMNS, DESCRIPTION, concatenated, fake_episodes, write_fake
 from huggingface_hub import DatasetCard
 
 from astra_data.core.config import load_recipe
@@ -47,11 +47,10 @@ def test_long_names_stand_below_the_table_and_facts_are_of_the_episodes_that_hav
     joints = tuple("abcde")
     columns = [Column("near", size=5, names=joints), Column("far", size=5, names=joints)]
     columns += [Column("few", size=4, names=joints[:4]), Column(SUCCESS, "bool")]
-    with writer(tmp_path / "wide", columns=columns) as out:
-        for uid, facts in enumerate(({"return": 1.0}, {"return": 3.0}, {})):
-            values = {column.name: np.zeros((500, column.size), np.float32) for column in columns[:3]}
-            out.add(Episode(uid, values | {SUCCESS: np.full(500, uid == 1)}, facts))
-    text = render_card(Dataset.open(tmp_path / "wide"), Notes())
+    values = {column.name: np.zeros((500, column.size), np.float32) for column in columns[:3]}
+    told = enumerate(({"return": 1.0}, {"return": 3.0}, dict[str, float]()))
+    episodes = (Episode(uid, values | {SUCCESS: np.full(500, uid == 1)}, facts) for uid, facts in told)
+    text = render_card(write_fake(tmp_path / "wide", episodes, columns=columns), Notes())
     assert "In `near` and `far`, in order: a, b, c, d, e." in text and text.count("in order") == 1
     assert "| `few` | float32 | (4,) |  | a, b, c, d |" in text
     assert "| return | mean 2.00; 1.00 to 3.00 |\n| success | 1 of 3 episodes (33.3%) |" in text

@@ -15,7 +15,6 @@ from astra_data.dataset.doctor.check import check
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.writer import StagedWriter
 from astra_data.pipeline.stages import collect as stage
-from astra_data.pipeline.stages import collect as suboptimal
 from astra_data.pipeline.stages.collect import CollectConfig, WallWatch, begin_drawing, collect, record
 from astra_data.policies.running_policy import PolicyFile, running
 from astra_data.robots.registry import TASKS
@@ -121,10 +120,10 @@ def test_episodes_begin_where_the_task_does_or_by_default_anywhere_in_a_maze(
 
 @pytest.fixture
 def small_training(monkeypatch: pytest.MonkeyPatch) -> None:
-    sac = suboptimal._SAC.model_copy(update={"rollout_steps": 8, "updates_per_step": 1, "batch_size": 8})
+    sac = stage._SAC.model_copy(update={"rollout_steps": 8, "updates_per_step": 1, "batch_size": 8})
     small = {"_SAC": sac, "_SAC_SIZES": (8,), "_SAC_ENVS": 4, "_PPO_ENVS": 4, "_TEST_EPISODES": 2}
     for name, value in small.items():
-        monkeypatch.setattr(suboptimal, name, value)
+        monkeypatch.setattr(stage, name, value)
     monkeypatch.setattr("astra_data.core.checkpoint.CHECKPOINT_SECONDS", 0.0)
     monkeypatch.setattr(stage, "_SAC_STEPS", 3 * 8 * 4)
     monkeypatch.setattr(stage, "_SAC_EPISODE_STEPS", 71)

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 import torch
-from fake_dataset import writer
+from fake_dataset import write_fake
 from small_run import TRAIN
 from torch import Tensor
 
@@ -191,8 +191,7 @@ def test_commands_beyond_those_of_the_dataset_are_counted(
     columns = [Column(name, size=2) for name in (STATE, NEXT_STATE, ACTION)]
     actions = narrower * np.array([[-1.0, -1.0], [1.0, 1.0], [0.0, 0.0]], np.float32)
     values = dict.fromkeys((STATE, NEXT_STATE, ACTION), actions)
-    with writer(tmp_path / "set", columns=columns) as made:
-        made.add(Episode(0, values, {}))
+    write_fake(tmp_path / "set", [Episode(0, values, {})], columns=columns)
     policy = {"policy": trained, "grounding": grounded}
     told, _ = make(task, "astra", tmp_path / "out", policy | {"recorded": tmp_path / "set"})
     assert told["beyond_recorded"] == expected

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fake_dataset import writer
+from fake_dataset import write_fake
 from toy_logs import write_logs
 
 from astra_data.core.errors import BadInputError
@@ -20,7 +20,6 @@ from astra_data.dataset.columns import (
     Episode,
 )
 from astra_data.dataset.reader import Dataset
-from astra_data.dataset.writer import DatasetWriter
 from astra_data.pipeline.stages.pair import PairConfig, pair, pair_steps
 from astra_data.robots.registry import TASKS, pairing_named
 
@@ -164,8 +163,7 @@ def test_data_of_another_rate_are_refused(collected: Path, tmp_path: Path) -> No
     source = Dataset.open(collected)
     description = {"name": "slow", "stage": "import", "environment": source.description["environment"]}
     slow = tmp_path / "slow"
-    with DatasetWriter(slow, source.schema, fps=10, task="slow", description=description) as writer:
-        writer.add(next(source.episodes()))
+    write_fake(slow, [next(source.episodes())], columns=source.schema, fps=10, description=description)
     told = r"slow has 10 steps per second, where point_mass makes 20; expected a dataset to be paired"
     with pytest.raises(BadInputError, match=told):
         pair("antmaze-umaze", dataset=slow, out=tmp_path / "out")
@@ -177,19 +175,18 @@ def rewritten(source: Dataset, out: Path, changed: dict[str, Column]) -> Path:
     """Write the first episode of a dataset with some columns called, and cut, as `changed` has them."""
     columns = [changed.get(column.name, column) for column in source.schema]
     description = {"name": "other", "stage": "import", "environment": source.description["environment"]}
-    with DatasetWriter(out, columns, fps=20, task="other", description=description) as writer:
-        episode = next(source.episodes())
-        cut = {name: episode.columns[name][:, : column.size] for name, column in changed.items()}
-        writer.add(replace(episode, columns={**episode.columns, **cut}))
-    return out
+    episode = next(source.episodes())
+    cut = {name: episode.columns[name][:, : column.size] for name, column in changed.items()}
+    other = replace(episode, columns={**episode.columns, **cut})
+    return write_fake(out, [other], columns=columns, description=description).root
 
 
 def test_bounds_of_the_commands_are_recorded(tmp_path: Path) -> None:
     """They say what the commands are multiples of to whoever learns from the pairs."""
     columns = [Column(STATE, size=2), Column(NEXT_STATE, size=2), Column(ACTION, size=1)]
     still = np.zeros((3, 2), np.float32)
-    with writer(tmp_path / "logs", columns=columns, fps=10) as logs:
-        logs.add(Episode(0, {STATE: still, NEXT_STATE: still, ACTION: still[:, 0]}, {}))
+    episode = Episode(0, {STATE: still, NEXT_STATE: still, ACTION: still[:, 0]}, {})
+    write_fake(tmp_path / "logs", [episode], columns=columns, fps=10)
     cart = f"{MINE.with_name('small_cart.py')}:TASK"
     out = pair(cart, dataset=tmp_path / "logs", out=tmp_path / "out")
     assert Dataset.open(out).description["simulator"]["commands"] == {"v": [-1.0, 4.0]}
