@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 from constant_policy import Constant
-from rail_run import make_rail_run
+from rail_run import rail_run
 from small_cart import TASK as CART
 from small_cart import Last
 from torch import Tensor
@@ -160,7 +160,7 @@ def test_a_policy_that_knows_no_simulator_cannot_be_tried() -> None:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_rail_run(tmp_path_factory.mktemp("judging"), seeds="[0]", methods='["nas"]')
+    return rail_run(tmp_path_factory, seeds=[0], methods=["nas"])
 
 
 @pytest.fixture
