@@ -129,6 +129,7 @@ def shown(recording: dict[str, dict[str, Any]]) -> set[int]:
     return {int(entity.split("/")[1].split("_")[1]) for entity in recording if "episode" in entity}
 
 
+@pytest.mark.usefixtures("quick_fits")
 def test_those_held_out_of_a_share_of_the_recordings_are_shown(run: Path, tmp_path: Path) -> None:
     head, _, tables = RECIPE.partition("[collect]")
     data = f'data = "{run / "collect/seed_3"}"\n[sweep]\npercent = [50]\n'
