@@ -145,7 +145,7 @@ def test_the_curve_has_every_iteration_and_null_for_what_is_undefined(tmp_path: 
     assert [point["steps"] for point in curve["points"]] == list(range(1, 11))
     assert [share for share, _ in notes] == pytest.approx([step / 10 for step in range(1, 11)])
     assert notes[0][1].endswith("success of training episodes unknown yet")
-    assert notes[-1][1].endswith("success of training episodes 0.33")  # the mean of 0.15 to 0.5
+    assert notes[-1][1].endswith("success of training episodes 0.40")  # the mean of the last five, 0.3 to 0.5
 
 
 def test_a_training_goes_on_from_its_last_checkpoint(tmp_path: Path) -> None:
