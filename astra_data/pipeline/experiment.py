@@ -199,6 +199,8 @@ def load_experiment(path: Path, root: Path) -> Experiment:
         if "based_on" in below:
             raise RecipeError(f"{path}: based_on: expected a recipe that is not based on another, got '{name}'")
         base = Experiment(validated(below, Recipe, str(base_path)), base_path, root / base_path.stem)
+        if "select" not in tables and isinstance(seeds := tables.get("seeds"), list) and len(seeds) < 2:
+            below.pop("select", None)  # it takes groundings of other seeds
         tables = _laid_over(below, tables)
     recipe = validated(tables, Recipe, str(path))
     if base:

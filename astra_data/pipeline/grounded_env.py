@@ -119,5 +119,7 @@ def _planned(
         raise BadInputError(f"{run} has several sizes: expected percent, one of {[*recipe.sweep.percent]}")
     places = [place for name in ARTIFACTS if name != "policy" and (place := call.keywords.get(name))]
     if missing := [str(place) for place in places if not place.is_dir()]:
+        if seed not in (seeds := settings_of(run).get("seeds", [seed])):
+            raise BadInputError(f"the run has no seed {seed}; its seeds: {', '.join(map(str, seeds))}")
         raise BadInputError(f"expected {', '.join(missing)}: run the recipe first")
     return call

@@ -360,8 +360,9 @@ class Task:
         }
         derived = {name: value for name, value in usual.items() if not getattr(self, name)}
         known = {"state": replace(self.state, name=STATE), "commands": commands}
-        if self.abstract_state:
-            known["abstract_state"] = usual["abstract_state"]
+        for name, called in (("action", ACTION), ("goal", GOAL), ("abstract_state", ABSTRACT_STATE)):
+            if (column := getattr(self, name)) and column.name != called:
+                known[name] = replace(column, name=called)
         for name, value in {**known, **derived, "derived": derived}.items():
             object.__setattr__(self, name, value)
 
@@ -411,7 +412,9 @@ class Task:
     def target(self, num_envs: int, **options: Any) -> TargetEnv:
         """Build `num_envs` target environments, driven by actions of ±1; `options` are their own."""
         if self.make_target is not None:
-            return self.make_target(self.objective, num_envs, **options)
+            given = ", ".join(f"{name}={value!r}" for name, value in options.items())
+            with explained(f"make_target(objective, {num_envs}, {given})"):
+                return self.make_target(self.objective, num_envs, **options)
         if self.robot is None:
             raise BadInputError(
                 f"task '{self.name}' has no target: give it a `robot`, or leave out what needs one (collect, "

@@ -65,6 +65,8 @@ def _rate(task: Task) -> None:
 def _drawn(task: Task, kind: str, size: int) -> Tensor:
     what = f"objective.draw_{kind}(rng, {_COUNT})"
     found = answered(what, getattr(task.objective, f"draw_{kind}"), generator(0, kind), _COUNT)
+    if kind == "goals" and size and np.shape(found) == (_COUNT, 0):
+        raise BadInputError(f"{what}: expected shape ({_COUNT}, {size}), as goal_size is {size}: write draw_goals")
     if kind == "goals" and np.ndim(found) == 2 and (drawn := np.shape(found)[1]) != size:
         raise BadInputError(
             f"{what}: expected shape ({_COUNT}, {size}), got {np.shape(found)}: write `goal_size = {drawn}` beside the "
@@ -111,7 +113,7 @@ def _beyond(task: Task) -> None:
 def _robot(task: Task) -> None:
     if task.robot is None:
         return
-    with explained("robot: to build, reset and step it"):
+    with explained("make_target: to reset and step it" if task.make_target else "robot: to build, reset and step it"):
         env = task.target(1, seed=0)
         env.reset()
         abstract = task.abstraction(env.state)

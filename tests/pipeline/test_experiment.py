@@ -207,6 +207,14 @@ def test_faults_are_told(longer: Path, text: str, expected: str) -> None:
         load_experiment(longer, longer.parent)
 
 
+def test_one_seed_inherits_no_choice_among_seeds(base: Path) -> None:
+    base.write_text(f"{base.read_text()}\n[select]\n")
+    other = base.with_name("other.toml")
+    for seeds, has_choice in (("[1]", False), ("[1, 0]", True)):
+        other.write_text(f'based_on = "base"\nseeds = {seeds}\n')
+        assert (load_experiment(other, base.parent).recipe.select is not None) == has_choice
+
+
 def test_there_is_no_chain(longer: Path) -> None:
     longer.with_name("third.toml").write_text('based_on = "longer"')
     with pytest.raises(RecipeError, match=r"expected a recipe that is not based on another, got 'longer'$"):

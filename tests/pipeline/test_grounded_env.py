@@ -168,7 +168,7 @@ def test_what_does_not_fit_is_answered_by_a_line(run: Path, tmp_path: Path) -> N
 
     refused("unknown method 'nass'", row="nass")
     refused("iql is not trained in a simulator: .* direct_transfer for the raw simulator", row="iql")
-    refused(r"expected .*pair/seed_3, .*ground/nas/seed_3: run the recipe first", seed=3)
+    refused(r"the run has no seed 3; its seeds: 0", seed=3)
     refused("the recipe has no size 50", percent=50)
     refused("unknown option 'episode_step': did you mean 'episode_steps'", episode_step=3)
     refused("unknown option 'reward'", reward="abstract")

@@ -9,7 +9,7 @@ import torch
 from small_cart import GIVEN, LOGS_ALONE, TASK, Rail, Reach
 
 from astra_data.core.errors import BadInputError
-from astra_data.dataset.columns import Column
+from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, STATE, Column
 from astra_data.methods.follower import careful
 from astra_data.pipeline.stages.collect import WallWatch
 from astra_data.robots.registry import TASKS
@@ -90,6 +90,12 @@ def test_what_was_filled_in_is_filled_in_anew_where_a_field_is_replaced() -> Non
     assert other.abstract_state.names == ("half",) and list(other.quantities) == ["half"]
     back = replace(other, make_simulator=Rail)
     assert back.simulator_id == "Rail" and back.abstraction is Rail.abstraction
+
+
+def test_columns_are_called_as_in_datasets_whatever_a_task_calls_them() -> None:
+    given = {"state": Column("states", size=2), "action": Column("act", size=1), "goal": Column("to", size=1)}
+    task = Task(**GIVEN | given)
+    assert [column.name for column in task.state_columns] == [STATE, GOAL, ACTION, NEXT_STATE]
 
 
 def test_what_was_given_stays_where_a_field_is_replaced() -> None:

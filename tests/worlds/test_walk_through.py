@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -150,6 +150,14 @@ WRONG: list[tuple[Task, str]] = [
         replace(objective(draw_goals=lambda self, rng, count: np.zeros((count, 2))), robot=None),
         "objective.draw_goals(rng, 3): expected shape (3, 1), got (3, 2): write `goal_size = 2` beside the "
         "objective's action_size",
+    ),
+    (
+        replace(objective(draw_goals=lambda self, rng, count: np.zeros((count, 0))), robot=None),
+        "objective.draw_goals(rng, 3): expected shape (3, 1), as goal_size is 1: write draw_goals",
+    ),
+    (
+        replace(TASK, make_target=cast(Any, lambda count: None)),
+        "make_target(objective, 1, seed=0) fails with TypeError: ",
     ),
     (
         replace(abstraction(lambda state: state[..., :1] * np.nan), robot=None),

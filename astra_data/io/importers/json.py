@@ -33,6 +33,8 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
         rows = [_picked(row, names, f"{source} row {number}") for number, row in enumerate(fields)]
         yield replace(_block(rows, names, origin), known=_flat(fields[0]))
         return
+    if fields in ([], {}):
+        raise BadInputError(f"{source} is empty: nothing was recorded, leave it out")
     fields = _flat(fields)
     if not isinstance(fields, dict):
         raise BadInputError(f"{source}: expected an object of fields, got {type(fields).__name__}")

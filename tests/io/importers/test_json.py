@@ -19,6 +19,13 @@ def test_json_that_is_too_large_is_told(tmp_path: Path, monkeypatch: pytest.Monk
         imported(tmp_path, path)
 
 
+@pytest.mark.parametrize("empty", ["[]", "{}"])
+def test_json_without_rows_is_told(tmp_path: Path, empty: str) -> None:
+    (tmp_path / "log.json").write_text(empty)
+    with pytest.raises(BadInputError, match=r"log.json is empty: nothing was recorded, leave it out"):
+        imported(tmp_path, tmp_path / "log.json")
+
+
 LISTS = ImportMapping.model_validate(
     {"name": "n", "task": "t", "fps": 1, "columns": {name: {"fields": (name,)} for name in ("x", "on")}}
 )
