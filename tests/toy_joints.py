@@ -1,9 +1,6 @@
 """Logs of toy joints in the form of PACE's: they follow targets late, with inertia, friction and a sag."""
 
-from pathlib import Path
-
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 FPS = 400
@@ -34,15 +31,3 @@ def positions(target: NDArray[np.float64], late_rows: int = LATE_ROWS) -> NDArra
         places.append(place)
     seen = np.array(places)
     return seen + np.random.default_rng(abs(int(1e6 * seen[-1, 0]))).normal(0, NOISE, seen.shape)
-
-
-def write_log(path: Path, rows: int, seed: int) -> Path:
-    """Write a log as scripts/pace/data_collection.py of leggedrobotics/pace-sim2real does."""
-    target = targets(rows, seed)
-    log = {
-        "time": torch.linspace(0, rows / FPS, steps=rows),
-        "dof_pos": torch.from_numpy(positions(target)[:-1]).float(),
-        "des_dof_pos": torch.from_numpy(target).float(),
-    }
-    torch.save(log, path)
-    return path

@@ -8,18 +8,11 @@ from pickle import UnpicklingError
 from typing import Any
 from zipfile import ZipFile, is_zipfile
 
-import numpy as np
-
 from astra_data.core.errors import BadInputError, optional
-from astra_data.dataset.columns import ACTION, STATE
 from astra_data.io.mapping import ImportMapping
 from astra_data.io.recording import VALUE_BYTES, Block, Source, row_count
 
 SUFFIXES = (".pt", ".pth")
-PACE = {STATE: "dof_pos", ACTION: "des_dof_pos"}
-"""Fields of the joint logs of PACE (leggedrobotics/pace-sim2real, scripts/pace/data_collection.py): positions
-before each row and the targets sent in it, both (T, joints) in rad; "time" (T,) in s."""
-TIME = "time"
 
 
 def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
@@ -30,20 +23,6 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     source.refuse_beyond(sum(VALUE_BYTES * value.numel() for value in used.values()))
     if n:
         yield Block({name: value.numpy() for name, value in used.items()}, str(source), known=tensors)
-
-
-def layout(source: Source) -> dict[str, Any]:
-    """Return the keys of a mapping for a joint log of PACE; fps is measured from its times."""
-    tensors = _tensors(source)
-    if missing := [field for field in (TIME, *PACE.values()) if field not in tensors]:
-        named = f"a joint log of PACE (time, dof_pos, des_dof_pos): no {', '.join(missing)}"
-        raise BadInputError(f"{source}: not {named}; pass --mapping")
-    times = tensors[TIME].double().numpy().ravel()
-    if len(times) < 2 or not times[-1] > times[0]:
-        raise BadInputError(f"{source}: expected times that rise; pass --mapping without `time`")
-    columns = {name: {"fields": [field], "unit": ["rad"]} for name, field in PACE.items()}
-    fps = max(1, round(1 / float(np.median(np.diff(times)))))
-    return {"columns": columns, "time": TIME, "fps": fps}
 
 
 def _tensors(source: Source) -> dict[str, Any]:

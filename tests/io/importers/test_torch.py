@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 from recordings import MAPPING, rows
-from toy_joints import FPS, NAMES, positions, targets, write_log
+from toy_joints import FPS, NAMES, positions, targets
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE
@@ -40,24 +40,13 @@ def test_a_log_of_pace_arrives_row_by_row(tmp_path: Path) -> None:
     assert names[STATE] == names[ACTION] and (names[STATE] or ())[:3] == NAMES
 
 
-def test_a_log_of_pace_needs_no_mapping(tmp_path: Path) -> None:
-    path = write_log(tmp_path / "three.pt", 1200, seed=3)
-    torch.save(torch.load(path) | {"spare": torch.zeros(1200)}, path)
-    report = import_dataset([path], name="three", out=tmp_path / "out")
-    dataset = Dataset.open(report.root)
-    assert (report.frames, dataset.info["fps"]) == (1199, FPS)
-    assert "observation.state from dof_pos; action from des_dof_pos\nfields left out: spare\n" in str(report)
-    expected = targets(1200, 3)[:-1].astype(np.float32)
-    np.testing.assert_array_equal(dataset.columns([ACTION])[ACTION], expected)
-
-
 def test_other_dictionaries_of_tensors_are_mapped(tmp_path: Path) -> None:
     fields = {name: torch.from_numpy(values) for name, values in rows().items()}
     torch.save(fields | {"robot": "walker", "rate": 3}, tmp_path / "log.pth")
     (tmp_path / "mapping.toml").write_text(MAPPING)
     report = import_dataset([tmp_path / "log.pth"], tmp_path / "mapping.toml", out=tmp_path / "out")
     assert report.episodes == 3
-    with pytest.raises(BadInputError, match=r"not a joint log of PACE .* no time, dof_pos, des_dof_pos"):
+    with pytest.raises(BadInputError, match=r"torch has no standard fields; pass --mapping FILE\.toml$"):
         import_dataset([tmp_path / "log.pth"], name="other", out=tmp_path / "other")
 
 
