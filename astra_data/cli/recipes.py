@@ -434,19 +434,18 @@ shipped = typer.Typer(no_args_is_help=True)
 
 @shipped.command("list")
 def list_() -> None:
-    """List the package's recipes and how long they take, and its mappings for `import`."""
+    """List the package's recipes, those to begin with first, and its mappings for `import`."""
     from rich.table import Table
     from rich.text import Text
 
-    from astra_data.pipeline.shipped import START_HERE, listed
+    from astra_data.pipeline.shipped import START_HERE, shipped_recipes
 
-    for title, recipes in listed().items():
-        table = Table("name", "takes", "what it is", title=title, title_justify="left", box=None)
-        for column in table.columns[:2]:
-            column.no_wrap = True  # the last one gives way
-        for recipe in recipes:
-            summary = Text(recipe.summary, no_wrap=True, overflow="ellipsis")
-            table.add_row(recipe.name, recipe.duration, summary)
+    found = sorted(shipped_recipes(), key=lambda one: one.name not in START_HERE)
+    for title, is_mapping in (("Recipes", False), ("Mappings, for astra-data import LOGS --mapping", True)):
+        table = Table("name", "what it is", title=title, title_justify="left", box=None)
+        table.columns[0].no_wrap = True
+        for recipe in (one for one in found if one.is_mapping == is_mapping):
+            table.add_row(recipe.name, Text(recipe.about, no_wrap=True, overflow="ellipsis"))
         arguments.show_table(table)
         typer.echo()
     typer.echo(f"To begin: astra-data recipes copy {START_HERE[0]}")

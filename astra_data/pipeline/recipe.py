@@ -184,7 +184,7 @@ class Recipe(Config):
 
     @field_validator("methods")
     @classmethod
-    def _are_knuser_methods(cls, rows: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
+    def _are_known_methods(cls, rows: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
         if "user_methods" not in info.data:
             return rows  # told already
         for row in rows:

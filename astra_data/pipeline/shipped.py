@@ -17,11 +17,7 @@ RECIPES = next(folder for folder in (_PACKAGE / "recipes", _PACKAGE.parent / "re
 
 IMPORTS = "imports"  # the folder of mappings, below `RECIPES`
 
-START_HERE = ("quickstart", "cart", "antmaze_quick")  # recipes to begin with, the first first
-_EXAMPLES = "Examples: your own robot, data and methods"
-_ROBOTS = {"antmaze": "An ant in mazes", "nao": "A humanoid robot, NAO", "humanoid": "A simulated humanoid"}
-"""Titles of groups, by the beginnings of tasks."""
-_DURATION = re.compile(r"About (\d+ \w+( per seed)?)( on [^.]*)?\.")
+START_HERE = ("quickstart", "cart", "antmaze_quick")  # recipes to begin with
 _COMMAND = re.compile(r"(uv run |astra-data |python |--)")
 
 
@@ -49,27 +45,6 @@ class ShippedRecipe:
         return str(self.table.get("task", self.base.task if self.base else ""))
 
     @property
-    def group(self) -> str:
-        """The title under which it is listed."""
-        if self.is_mapping:
-            return "Mappings, for astra-data import LOGS --mapping"
-        return "Start here" if self.name in START_HERE else _ROBOTS.get(self.task.partition("-")[0], _EXAMPLES)
-
-    @property
-    def duration(self) -> str:
-        """How long it takes, as its first comments say: without that, how much there is to train."""
-        if found := _DURATION.search(self.about):
-            return found[1]
-        table = (self.base.table if self.base else {}) | self.table
-        counts = [len(table.get(key, ())) for key in ("methods", "seeds")]
-        return f"hours ({counts[0]} rows, {counts[1]} seeds)" if all(counts) else ""
-
-    @property
-    def summary(self) -> str:
-        """What it is, in a sentence."""
-        return _DURATION.sub("", self.about).partition(". ")[0].strip().rstrip(".")
-
-    @property
     def files(self) -> set[Path]:
         """The files that it needs, below `RECIPES`: its base, code, and what its head names."""
         folders = [RECIPES / self.path.parent]
@@ -91,15 +66,6 @@ def shipped_recipes() -> tuple[ShippedRecipe, ...]:
     found = [ShippedRecipe(path.relative_to(RECIPES)) for path in RECIPES.rglob("*.toml")]
     kept = [one for one in found if {"methods", "based_on"} & one.table.keys() or one.is_mapping]
     return tuple(sorted(kept, key=lambda one: one.name))
-
-
-def listed() -> dict[str, list[ShippedRecipe]]:
-    """Return all recipes and mappings by the titles of their groups, what to begin with first."""
-    groups: dict[str, list[ShippedRecipe]] = {title: [] for title in ("Start here", _EXAMPLES)}
-    for recipe in sorted(shipped_recipes(), key=lambda one: one.is_mapping):
-        groups.setdefault(recipe.group, []).append(recipe)
-    groups["Start here"].sort(key=lambda recipe: START_HERE.index(recipe.name))
-    return groups
 
 
 def shipped(name: str) -> ShippedRecipe:

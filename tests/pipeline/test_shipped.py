@@ -7,7 +7,7 @@ from typer.testing import CliRunner
 from astra_data.cli.app import app
 from astra_data.core.errors import BadInputError
 from astra_data.pipeline.experiment import load_experiment
-from astra_data.pipeline.shipped import RECIPES, copy_recipe, shipped, shipped_recipes
+from astra_data.pipeline.shipped import RECIPES, START_HERE, copy_recipe, shipped, shipped_recipes
 from astra_data.reports.results import merge, read_results
 
 
@@ -65,7 +65,7 @@ def test_what_is_there_is_kept(tmp_path: Path) -> None:
 
 def test_the_command_line_lists_and_copies(tmp_path: Path) -> None:
     listed = CliRunner().invoke(app, ["recipes", "list"], env={"COLUMNS": "80"}).output.splitlines()
-    assert listed[0].strip() == "Start here" and listed[2].split()[:3] == ["quickstart", "3", "minutes"]
+    assert listed[0].strip() == "Recipes" and [line.split()[0] for line in listed[2:5]] == sorted(START_HERE)
     names = [line.split()[0] for line in listed if line.strip()]
     assert [names.count(recipe.name) for recipe in shipped_recipes()] == [1] * len(shipped_recipes())
     assert max(map(len, listed)) <= 80 and "ros2_base" in "\n".join(listed).partition("Mappings")[2]

@@ -38,7 +38,7 @@ class ReportConfig(Config):
 
     @field_validator("trajectory_methods", "paper_success", "compare")
     @classmethod
-    def _name_knuser_methods[R: (tuple[str, ...], dict[str, float])](cls, rows: R) -> R:
+    def _name_known_methods[R: (tuple[str, ...], dict[str, float])](cls, rows: R) -> R:
         with as_fault():
             for row in rows:
                 method_named(row)
