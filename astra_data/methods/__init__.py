@@ -12,7 +12,6 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.naming import PLUS, base_method, is_plus
 from astra_data.grounding.files import kinds
 from astra_data.grounding.fit import HistoryFit
-from astra_data.grounding.simulator import Grounding
 from astra_data.methods import astra, follower, iql
 from astra_data.methods.method import Method, Role, Source, Table
 from astra_data.methods.rma import RMA
@@ -100,8 +99,7 @@ def _faults(method: Method) -> Iterator[str]:
         yield f"learns a {policy.__name__}, without {missing}: expected the class of what learn returns"
     if grounding and method.fit is None:
         yield "has a grounding that nothing fits: expected fit"
-    others = "" if not grounding or issubclass(grounding, Grounding) else "the other parts"
-    if grounding and (missing := _missing(grounding) or others):
+    if grounding and (missing := _missing(grounding, "corrected", "simulator")):
         yield f"has a grounding, {grounding.__name__}, without {missing}: expected a subclass of FittedGrounding"
     if table is None:
         return

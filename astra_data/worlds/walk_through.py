@@ -65,13 +65,9 @@ def _rate(task: Task) -> None:
 def _drawn(task: Task, kind: str, size: int) -> Tensor:
     what = f"objective.draw_{kind}(rng, {_COUNT})"
     found = answered(what, getattr(task.objective, f"draw_{kind}"), generator(0, kind), _COUNT)
-    if kind == "goals" and size and np.shape(found) == (_COUNT, 0):
-        raise BadInputError(f"{what}: expected shape ({_COUNT}, {size}), as goal_size is {size}: write draw_goals")
     if kind == "goals" and np.ndim(found) == 2 and (drawn := np.shape(found)[1]) != size:
-        raise BadInputError(
-            f"{what}: expected shape ({_COUNT}, {size}), got {np.shape(found)}: write `goal_size = {drawn}` beside the "
-            "objective's action_size"
-        )
+        advice = f"`goal_size = {drawn}` beside the objective's action_size" if drawn else "draw_goals"
+        raise BadInputError(f"{what}: expected shape ({_COUNT}, {size}), got {np.shape(found)}: write {advice}")
     if not isinstance(found, np.ndarray):
         raise BadInputError(f"{what}: expected a NumPy array, got a {type(found).__name__}")
     return expect(what, torch.from_numpy(np.ascontiguousarray(found)), (_COUNT, size)).float()

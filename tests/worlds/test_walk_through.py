@@ -153,7 +153,7 @@ WRONG: list[tuple[Task, str]] = [
     ),
     (
         replace(objective(draw_goals=lambda self, rng, count: np.zeros((count, 0))), robot=None),
-        "objective.draw_goals(rng, 3): expected shape (3, 1), as goal_size is 1: write draw_goals",
+        "objective.draw_goals(rng, 3): expected shape (3, 1), got (3, 0): write draw_goals",
     ),
     (
         replace(TASK, make_target=cast(Any, lambda count: None)),
