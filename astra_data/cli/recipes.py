@@ -226,18 +226,18 @@ def select(
     given: dict[str, Any] = {"rows": row or (), "judge": judge, "episodes": episodes}
     tried: dict[str, Any] = {"field": field, "percent": percent}
     if trials is not None and by_hand:  # a display would hide what a person is asked
-        echo = lambda _, note: typer.echo(note, err=True)  # noqa: E731
-        lines = [_chosen(choose_by_trials(run, trials, by_hand=_key, progress=echo, **tried, **given))]
-    elif trials is not None:
-        with shown("select") as progress:
-            lines = [_chosen(choose_by_trials(run, trials, progress=progress, **tried, **given))]
+        given["progress"] = lambda _, note: typer.echo(note, err=True)
+        lines = [_chosen(choose_by_trials(run, trials, by_hand=_key, **tried, **given))]
     else:
-        with shown("select") as progress:
-            judged, lines = rank(run, progress=progress, **given), []
-            for size in judged.percents:
-                first, at = judged.ranked(size)[0], f" at {size} %" if size else ""
-                reached = f"{first.lower:.2f} in the lower quartile of its judges"
-                lines.append(f"chosen{at}: {first.row}, seed {first.seed}: {reached}")
+        with shown("select") as given["progress"]:
+            if trials is not None:
+                lines = [_chosen(choose_by_trials(run, trials, **tried, **given))]
+            else:
+                judged, lines = rank(run, **given), []
+                for size in judged.percents:
+                    first, at = judged.ranked(size)[0], f" at {size} %" if size else ""
+                    reached = f"{first.lower:.2f} in the lower quartile of its judges"
+                    lines.append(f"chosen{at}: {first.row}, seed {first.seed}: {reached}")
     typer.echo("\n".join([*lines, f"written: {run / FOLDER / 'select.md'}"]))
 
 

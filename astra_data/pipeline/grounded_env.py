@@ -13,7 +13,7 @@ from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.methods import method_named
 from astra_data.pipeline.plan import ARTIFACTS, plan, selected
 from astra_data.pipeline.recipe import Recipe
-from astra_data.pipeline.trained_policy import settings_of
+from astra_data.pipeline.trained_policy import check_seed, settings_of
 from astra_data.pipeline.user_code import add_all
 from astra_data.policies.learner import ActingPolicy
 from astra_data.policies.running_policy import PolicyFile
@@ -119,7 +119,6 @@ def _planned(
         raise BadInputError(f"{run} has several sizes: expected percent, one of {[*recipe.sweep.percent]}")
     places = [place for name in ARTIFACTS if name != "policy" and (place := call.keywords.get(name))]
     if missing := [str(place) for place in places if not place.is_dir()]:
-        if seed not in (seeds := settings_of(run).get("seeds", [seed])):
-            raise BadInputError(f"the run has no seed {seed}; its seeds: {', '.join(map(str, seeds))}")
+        check_seed(settings_of(run), seed)
         raise BadInputError(f"expected {', '.join(missing)}: run the recipe first")
     return call

@@ -53,7 +53,8 @@ def view_run(run: Path, uids: Sequence[int] = (), *, seed: int | None = None, sa
             share, drawn = item.call.keywords["config"].held_out_share, item.call.keywords["seed"]
             if (data := item.call.keywords["dataset"]).is_dir():
                 check_made_from(made, {"dataset": Dataset.open(data).content_hash})
-            held_out = PairedEpisodes.load(data if data.is_dir() else pairs).split(share, drawn)[1]
+            whole = PairedEpisodes.load(data) if data.is_dir() and data != pairs else episodes
+            held_out = whole.split(share, drawn)[1]
             simulators[row_of_key(item.key)] = load_grounding(made)
     wanted = torch.tensor(uids or held_out.uids[:5].tolist())
     episodes, task = (episodes.select(torch.isin(episodes.uids, wanted).nonzero()[:, 0]), task_named(recipe.task))

@@ -103,15 +103,20 @@ def settings_of(run: str | Path) -> dict[str, Any]:
     return settings
 
 
+def check_seed(settings: dict[str, Any], seed: int) -> None:
+    """Refuse a `seed` that the `settings` of a run do not have."""
+    if seed not in (seeds := settings.get("seeds", [seed])):
+        raise BadInputError(f"the run has no seed {seed}; its seeds: {', '.join(map(str, seeds))}")
+
+
 def _files(settings: dict[str, Any], folder: Path, row: str, seed: int, percent: int | None) -> dict[str, Path]:
     user_methods = settings.get("user_methods", {})
     add_all(user_methods)
     files = {"train": folder / artifact_key("train", row, seed, percent) / POLICY}
-    rows, seeds = settings.get("methods", [row]), settings.get("seeds", [seed])
-    if not files["train"].is_file() and row not in rows:
-        raise BadInputError(f"the run has no row '{row}'{did_you_mean(row, rows)}")
-    if not files["train"].is_file() and seed not in seeds:
-        raise BadInputError(f"the run has no seed {seed}; its seeds: {', '.join(map(str, seeds))}")
+    if not files["train"].is_file():
+        if row not in (rows := settings.get("methods", [row])):
+            raise BadInputError(f"the run has no row '{row}'{did_you_mean(row, rows)}")
+        check_seed(settings, seed)
     method, base = method_named(row), grounded_as(row)
     if not method.trains:
         raise BadInputError(f"{row} has no trained policy: it is written by hand")
