@@ -26,7 +26,6 @@ WORDS = {
     "iql": "IQL: implicit Q-learning, from the recorded steps alone",
     "rma": "RMA: rapid motor adaptation",
     "compass": "COMPASS: simulator parameters fitted to the episodes",
-    "compass_uniform": "COMPASS, uniform: simulator parameters drawn from wide ranges",
 }  # what the names of methods stand for
 
 

@@ -124,7 +124,7 @@ def evaluate(
             )
             for kind, robot in row.robots.items()
         }
-        if row.facts:
+        if len(tested) > 1:
             outcomes = {kind: episodes.outcome.to_json() for kind, episodes in tested.items()}
             measures = [score.measure for score in world.objective.scores]
             results["encoders"] = {kind: {one: fmean(of[one]) for one in measures} for kind, of in outcomes.items()}
