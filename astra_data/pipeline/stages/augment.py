@@ -284,17 +284,17 @@ def _moving(source: Dataset) -> list[Column]:
 
 def _shares(source: Dataset, mover: Relocation, config: AugmentConfig, seed: int) -> tuple[Bools, NDArray[np.intp]]:
     """Return which episodes are held out (E,), and how many copies each is to have (E,)."""
-    count = len(source)
-    training, held = held_out_episodes(count, config.held_out_share, seed)
-    held_out = np.isin(np.arange(count), held)
+    count, recordings = len(source), source.recordings
+    training, held = held_out_episodes(int(recordings.max()) + 1, config.held_out_share, seed)
+    held_out = np.isin(recordings, held)  # a recording may have several parts
     usable = ~held_out
     for index, episode in enumerate(source.episodes([STATE, NEXT_STATE])):
         usable[index] &= bool(mover.stretches(episode))
     if not usable.any():
         raise BadInputError(
-            f"{source.reference}: none of {len(training)} training episodes keeps {mover.margin_m:g} m "
+            f"{source.reference}: none of {(~held_out).sum()} training episodes keeps {mover.margin_m:g} m "
             f"from the walls for {config.min_steps} steps: lower --margin-m, --min-steps or --held-out-share "
-            f"({len(held)} episodes)"
+            f"({held_out.sum()} episodes)"
         )
     copies = np.zeros(count, dtype=np.intp)
     copies[usable] = _COPIES
@@ -303,5 +303,6 @@ def _shares(source: Dataset, mover: Relocation, config: AugmentConfig, seed: int
             raise BadInputError(f"--episodes {config.episodes}: expected at least {count}, the number of originals")
         each, more = divmod(config.episodes - count, int(usable.sum()))
         copies[usable] = each
-        copies[training[usable[training]][:more]] += 1
+        drawn = np.argsort(np.argsort(np.append(training, held))[recordings], kind="stable")
+        copies[drawn[usable[drawn]][:more]] += 1
     return held_out, copies

@@ -184,7 +184,7 @@ def test_the_seed_decides_every_byte(collected: Path, augmented: Path, tmp_path:
 class Ten:
     """Ten episodes, by their numbers; of number 3 no stretch can be copied."""
 
-    reference, margin_m = "ten", 0.0
+    reference, margin_m, recordings = "ten", 0.0, np.arange(10)
 
     def __len__(self) -> int:
         return 10
@@ -211,6 +211,16 @@ def test_a_share_is_held_out_at_least_one_unless_it_is_none(share: float, count:
     usable = ~held_out & (np.arange(10) != 3)
     assert (copies[usable] == 3).all()
     assert (len({tuple(shares(seed, held_out_share=share)[0]) for seed in range(9)}) > 1) == (share > 0)
+
+
+def test_parts_of_a_recording_are_held_out_together() -> None:
+    ten: Any = Ten()
+    ten.recordings = np.array([0, 1, 2, 3, 4, 4, 2, 1, 0, 4])
+    for seed in range(5):
+        held_out, copies = _shares(ten, ten, AugmentConfig(episodes=11, held_out_share=0.4), seed)
+        held = {*ten.recordings[held_out].tolist()}
+        assert len(held) == 2 and (held_out == np.isin(ten.recordings, [*held])).all()
+        assert copies.sum() == 1 and not copies[held_out].any()
 
 
 def test_copies_make_up_the_episodes_that_are_asked_for_and_the_odd_ones_are_of_any() -> None:
