@@ -1,4 +1,4 @@
-"""`astra-data import`, `export`, `card`, `push` and `pull`."""
+"""Commands that exchange datasets with other formats and other people."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any

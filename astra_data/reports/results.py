@@ -99,7 +99,7 @@ class Results(Facts):
 
     recipe: str
     task: str
-    command: str  # the command that produced these results
+    command: str  # the commands that produced these results, a line each
     rows: tuple[str, ...]  # methods of the recipe, each alone or with `_plus`, in the order of the tables
     scores: tuple[Score, ...] = (SUCCESS,)  # scores that methods are compared by, the headline first
     compare: tuple[str, ...] = ("astra",)  # methods that are compared with the others
@@ -303,6 +303,7 @@ def merge(sources: Sequence[Results]) -> Results:
     candidates = {(one.row, one.seed, one.percent): one for of in judged for one in of.candidates}
     return last.model_copy(
         update={
+            "command": "\n".join(dict.fromkeys(line for one in sources for line in one.command.splitlines())),
             "rows": tuple(dict.fromkeys([*last.rows, *(row for one in sources for row in one.rows)])),
             "judged": judged[-1].model_copy(update={"candidates": [*candidates.values()]}) if judged else None,
             "trials": next((one.trials for one in reversed(sources) if one.trials), None),

@@ -95,10 +95,13 @@ def test_merging_loses_nothing_and_says_what_it_replaces() -> None:
         rows=("nas", "astra"),
         errors=[error("nas", 0, "raw", 1.0, 2.0)],
         judged=judged(0),
+        command="run --seed 1\nrun --seed 0",
     )
-    second = results(line("astra", 1, success=0.75), line("astra", 2, success=1.0), rows=("astra",), judged=judged(1))
+    later = line("astra", 1, success=0.75), line("astra", 2, success=1.0)
+    second = results(*later, rows=("astra",), judged=judged(1), command="run --seed 2\nrun --seed 1")
     merged = merge([first, second])
     assert merged.judged and [one.seed for one in merged.judged.candidates] == [0, 1]
+    assert merged.command.split("run --seed ")[1:] == ["1\n", "0\n", "2"]
     assert merged.rows == ("astra", "nas") and merged.values("astra", "success") == {0: 0.25, 1: 0.75, 2: 1.0}
     assert merged.values("nas", "success") == {0: 1.0} and merged.errors == first.errors
     assert replaced(first, second) == ["astra seed 1 (success 0.5, now 0.75)"] and replaced(first, first) == []
