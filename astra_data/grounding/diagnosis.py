@@ -16,6 +16,7 @@ from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import open_dataset
 from astra_data.robots.registry import Pairing, built, pairing_named
 from astra_data.worlds.protocols import AbstractSimulator
+from astra_data.worlds.user_code import stepped
 
 LONGEST_S, LONGEST_STEPS = 2.0, 20  # longest delay that is looked for: the shorter of the two
 FEWEST = 10  # recordings from which on a forecast is made
@@ -108,7 +109,7 @@ def diagnose(dataset: str | Path, simulator: str, progress: Progress = silent) -
         *_of_responses(responses, source.info["fps"]),
         *_of_hidden_state([*explained.values()], shown),
         *_of_commands(log, commands),
-        *_of_forecast(forecast, missed),
+        *(_of_forecast(forecast, missed) if known.error.size else ()),
     )
     return Diagnosis(
         source.reference,
@@ -214,7 +215,8 @@ def _responses(log: _Log, felt: _Felt, names: Sequence[str], fps: float) -> tupl
 def _moved(simulators: AbstractSimulator, state: Floats, action: Floats) -> Floats:
     """Return where N simulators that are set to `state` (N, X) land with `action` (N, A)."""
     simulators.reset_to(torch.from_numpy(state.astype(np.float32)))
-    return np.asarray(simulators.step(torch.from_numpy(np.ascontiguousarray(action, np.float32))), np.float64)
+    command = torch.from_numpy(np.ascontiguousarray(action, np.float32))
+    return np.asarray(stepped(simulators, command, "step of the simulator"), np.float64)
 
 
 def _refitted(features: Floats, moved: Floats, recording: Ints, axes: int) -> Floats:
@@ -296,14 +298,14 @@ class _Error:
         made = log.error
         moved = np.abs(log.next_state - log.state).max(axis=0) + 1e-12
         wrong = made[felt.rows].std(axis=0) > 1e-6 * moved
-        commands = felt.changes[:, :, 1 : _PAST_STEPS + 1, wrong]
+        commands = felt.changes[:, :, 1 : _PAST_STEPS + 1].reshape(len(felt.rows), -1, len(wrong))[..., wrong]
         past = [log.before(made[:, wrong], steps)[felt.rows] for steps in range(1, _PAST_STEPS + 1)]
         return cls(
             felt.rows,
             made[felt.rows][:, wrong],
             np.unique(log.recording[felt.rows], return_inverse=True)[1],
             _products(np.concatenate([log.state, log.action], axis=1)[felt.rows]),
-            commands.reshape(len(felt.rows), -1, int(wrong.sum())).transpose(2, 0, 1),
+            commands.transpose(2, 0, 1),
             np.concatenate(past, axis=1),
         )
 

@@ -152,7 +152,10 @@ class HistoryFit:
         if not predicts_failures:
             windows = replace(windows, goes_on=windows.goes_on + windows.failed)
         episodes = replace(episodes, windows=windows)
-        return episodes if self.printed or not episodes.has_rewards else with_own_rewards(task, episodes)
+        if self.printed or not episodes.has_rewards:
+            return episodes
+        episodes.check(task, needs_goals=True)
+        return with_own_rewards(task, episodes)
 
 
 def with_own_rewards(task: Task, episodes: PairedEpisodes) -> PairedEpisodes:

@@ -151,8 +151,8 @@ class PairedEpisodes:
             commands=commands,
         )
 
-    def check(self, task: Task) -> None:
-        """Check that states, actions and, where there are any, goals are those of `task`."""
+    def check(self, task: Task, *, needs_goals: bool = False) -> None:
+        """Check that states, actions and goals, unless there are none and nothing needs them, are those of `task`."""
         faults = [
             f"has {found} values in {what}, {task.name} {expected}"
             for what, found, expected in (
@@ -168,6 +168,8 @@ class PairedEpisodes:
             faults.append(f"was paired for commands within {within}, {task.name} has {dict(task.limits)}")
         if faults:
             raise BadInputError(f"{self.reference} {'; '.join(faults)}: pair it again, with the simulator of this task")
+        if needs_goals and task.objective.goal_size and not self.windows.goal.shape[-1]:
+            raise BadInputError(f"{self.reference} lacks the goals of {task.name}: run `astra-data label` first")
 
     def __len__(self) -> int:
         return len(self.target_state)

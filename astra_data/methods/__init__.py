@@ -16,6 +16,7 @@ from astra_data.methods import astra, follower, iql
 from astra_data.methods.method import Method, Role, Source, Table
 from astra_data.methods.rma import RMA
 from astra_data.policies.learner import add_policy_kind
+from astra_data.policies.simulator_env import RewardSource
 from astra_data.policies.train import InSimulator, UserLearner
 from astra_data.worlds.user_code import offered, user_object
 
@@ -79,27 +80,43 @@ def add_method(name: str, place: str) -> None:
 
 def _faults(method: Method) -> Iterator[str]:
     """Yield what a method of the user's lacks to be a row."""
-    if method.color and not _COLOR.fullmatch(method.color):
+    if method.color and not _COLOR.fullmatch(str(method.color)):
         yield f'has the color {method.color!r}: expected "#rrggbb"'
     choices = {"role": (None, *get_args(Role)), "learns_from": get_args(Source), "configures": ("ground", "train")}
+    choices |= {"reward": get_args(RewardSource), "ranges": (None, "randomized", "wide")}
+    given = vars(method) | (vars(method.learn) if isinstance(method.learn, InSimulator) else {})
     for name, known in choices.items():
-        if (value := getattr(method, name)) not in known:
+        if (value := given.get(name, known[0])) not in known:
             yield f"has {name}={value!r}: expected {', '.join(map(repr, known))}"
-    if method.fit is not None and not callable(method.fit):
-        yield f"has fit={method.fit!r}: expected a function"
+    for name in ("fit", "learn"):
+        if (value := getattr(method, name)) is not None and not callable(value):
+            yield f"has {name}={value!r}: expected a function"
     table, grounding, learn = method.table, method.grounding, method.learn
+    if table is not None and not isinstance(table, Table):
+        yield f"has table={table!r}: expected a Table of its name in recipes and the class of its settings"
+        return
     policy = learn.policy if isinstance(learn, UserLearner) else None
-    classes = {"grounding": grounding, "policy": policy, "table": table and table.model}
+    encoder = method.fit.encoder if isinstance(method.fit, HistoryFit) else None
+    classes = {"grounding": grounding, "policy": policy, "encoder": encoder, "table": table and table.model}
     if objects := [name for name, made in classes.items() if made is not None and not isinstance(made, type)]:
         yield f"has an object as {', '.join(objects)}: expected its class"
         return
+    if encoder and (missing := _missing(encoder, "initial", "step", "latent", "sequence")):
+        yield f"has an encoder, {encoder.__name__}, without {missing}: expected a subclass of Encoder"
     if learn is None:
         yield "learns no policy: expected learn, an UserLearner that returns one"
-    elif policy and (missing := _missing(policy, "act")):
+    elif policy and (missing := _missing(policy, "to_file", "from_file", "act")):
         yield f"learns a {policy.__name__}, without {missing}: expected the class of what learn returns"
-    if grounding and method.fit is None:
-        yield "has a grounding that nothing fits: expected fit"
-    if grounding and (missing := _missing(grounding, "corrected", "simulator")):
+    used = [name for name in ("grounding", "aligns", "grounded_as") if getattr(method, name)]
+    if used and method.fit is None:
+        yield f"has {', '.join(used)}, and nothing is fitted: expected fit"
+    elif method.grounded_as in METHODS and METHODS[method.grounded_as].fit != method.fit:
+        yield f"is grounded as {method.grounded_as}, which has another fit: expected the same"
+    if isinstance(method.fit, HistoryFit) and given.get("reward") == "predicted" and not method.fit.reward:
+        yield "is paid a reward that nothing predicts: expected HistoryFit(reward=True)"
+    if method.initial in METHODS and (METHODS[method.initial].grounds or not METHODS[method.initial].trains):
+        yield f"starts from the policy of {method.initial}: expected a method that learns one, and fits nothing"
+    if grounding and (missing := _missing(grounding, "to_file", "from_file", "corrected", "simulator")):
         yield f"has a grounding, {grounding.__name__}, without {missing}: expected a subclass of FittedGrounding"
     if table is None:
         return
@@ -112,10 +129,10 @@ def _faults(method: Method) -> Iterator[str]:
         yield 'has settings that nothing reads: expected configures="ground" if they are those of fit'
 
 
-def _missing(made: type, *more: str) -> str:
-    """Return what a class lacks of what is needed to read its files."""
+def _missing(made: type, *needed: str) -> str:
+    """Return what a class lacks of a kind and of the methods `needed`."""
     abstract = getattr(made, "__abstractmethods__", ())
-    missing = [one for one in ("to_file", "from_file", *more) if one in abstract or not hasattr(made, one)]
+    missing = [one for one in needed if one in abstract or not hasattr(made, one)]
     return ", ".join(missing if isinstance(getattr(made, "kind", None), str) else ["kind, a string", *missing])
 
 

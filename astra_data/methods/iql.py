@@ -212,7 +212,8 @@ class Iql:
 
 def transitions(experience: Experience, config: IqlConfig) -> Transitions:
     """Return the transitions (N,) of `experience` with returns of `config.return_steps` and the observation then."""
-    count, lengths = config.return_steps, experience.lengths[:, None]
+    lengths = experience.lengths[:, None]
+    count = min(config.return_steps, int(lengths.max()) + 1)  # no episode has more
     step = torch.arange(experience.reward.shape[1], device=lengths.device).expand_as(experience.reward)
     reward = (experience.reward * config.reward_scale) * (step < lengths)
     weights = config.discount ** torch.arange(count, device=reward.device)
@@ -223,7 +224,7 @@ def transitions(experience: Experience, config: IqlConfig) -> Transitions:
     whole = (step + count <= lengths) | (terminated & (step < lengths))
     if not bool(whole.any()):
         raise BadInputError(
-            f"expected an episode of at least {count} steps (return_steps), or one that ends the task; "
+            f"expected an episode of at least {config.return_steps} steps (return_steps), or one that ends the task; "
             f"the longest has {int(lengths.max())}"
         )
     columns = experience.observation, experience.action, summed, experience.next_observation[rows], terminated

@@ -14,6 +14,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 from torch import Tensor
 
+from astra_data.core.lazy import without_gradients
 from astra_data.core.seeding import derive, fresh_seed
 from astra_data.grounding.descent import seeded
 from astra_data.grounding.simulator import NO_GROUNDING
@@ -55,6 +56,7 @@ class SeededSimulatorEnv:
         with seeded(int(self._rng.integers(2**62)), torch.device("cpu")):
             return self.env.reset(mask)
 
+    @without_gradients
     def step(self, action: Tensor) -> Step:
         """Apply `action` (B, A), clipped to ±1."""
         with torch.random.fork_rng(devices=[]):

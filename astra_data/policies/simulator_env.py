@@ -123,12 +123,13 @@ class SimulatorEnv:
         command = self.objective.limit_command(action, self.world.command_limit)
         after = self.simulator.step(command)
         success = self.objective.reached(after, self.goal)
-        self.failed = self.objective.missed(after, self.goal)
+        failed = self.objective.missed(after, self.goal)
         if self.objective.ends_at_walls:
-            self.failed = self.failed | (self.simulator.blocked & ~success)
+            failed = failed | self.simulator.blocked
         risk = self.simulator.failure_risk()
         if risk is not None and self.draws_failures:
-            self.failed = self.failed | ((torch.rand_like(risk) < risk) & ~success)
+            failed = failed | (torch.rand_like(risk) < risk)
+        self.failed = failed & ~success
         reward = self.objective.reward(before, after, self.goal, self.failed)
         if self.world.reward == "priced" and risk is not None:
             reward = reward + self.penalty_scale * RISK_WEIGHT * self.objective.failure_reward * risk

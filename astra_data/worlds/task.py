@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError
-from astra_data.core.lazy import Tensor, torch
+from astra_data.core.lazy import Tensor, torch, without_gradients
 from astra_data.core.naming import first_few
 from astra_data.core.seeding import derive, generator
 from astra_data.dataset.columns import ABSTRACT_STATE, ACTION, GOAL, NEXT_STATE, STATE, Column
@@ -148,6 +148,7 @@ class RobotEnv:
         """Start new episodes."""
         self.reset()
 
+    @without_gradients
     def _abstract(self) -> Tensor:
         return torch.as_tensor(self._abstraction(self.state))
 

@@ -17,7 +17,7 @@ from typing import Any
 
 from astra_data.core.durable import file_digest
 from astra_data.core.errors import AstraDataError, BadInputError
-from astra_data.core.lazy import Tensor, torch
+from astra_data.core.lazy import Tensor, torch, without_gradients
 from astra_data.worlds.objective import Objective
 from astra_data.worlds.protocols import AbstractSimulator
 
@@ -297,6 +297,7 @@ def expect_tensor(what: str, found: object) -> Tensor:
     return found
 
 
+@without_gradients
 def stepped(simulator: AbstractSimulator, command: Tensor, what: str) -> Tensor:
     """Return the states (B, X) that a step with `command` (B, A) leads to; errors begin with `what`."""
     return expect_tensor(what, answered(what, simulator.step, command))

@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Callable
+from operator import index
 
 import numpy as np
 
@@ -65,11 +66,12 @@ def _rate(task: Task) -> None:
 def _drawn(task: Task, kind: str, size: int) -> Tensor:
     what = f"objective.draw_{kind}(rng, {_COUNT})"
     found = answered(what, getattr(task.objective, f"draw_{kind}"), generator(0, kind), _COUNT)
-    if kind == "goals" and np.ndim(found) == 2 and (drawn := np.shape(found)[1]) != size:
+    if not isinstance(found, np.ndarray) or found.dtype.kind not in "biuf":
+        got = f"one of {found.dtype}" if isinstance(found, np.ndarray) else f"a {type(found).__name__}"
+        raise BadInputError(f"{what}: expected a NumPy array of numbers, got {got}")
+    if kind == "goals" and found.ndim == 2 and (drawn := found.shape[1]) != size:
         advice = f"`goal_size = {drawn}` beside the objective's action_size" if drawn else "draw_goals"
-        raise BadInputError(f"{what}: expected shape ({_COUNT}, {size}), got {np.shape(found)}: write {advice}")
-    if not isinstance(found, np.ndarray):
-        raise BadInputError(f"{what}: expected a NumPy array, got a {type(found).__name__}")
+        raise BadInputError(f"{what}: expected shape ({_COUNT}, {size}), got {found.shape}: write {advice}")
     return expect(what, torch.from_numpy(np.ascontiguousarray(found)), (_COUNT, size)).float()
 
 
@@ -88,13 +90,13 @@ def _abstraction(task: Task) -> None:
                 f"{what}: expected a {type(given).__name__} of shape {wanted}, got a {type(found).__name__} "
                 f"of {shape}; abstract_state has {wanted[1]} values"
             )
-        expect(what, torch.as_tensor(found), wanted)
+        expect(what, answered(what, torch.as_tensor, found), wanted)
 
 
 def _quantities(task: Task) -> None:
     size = task.abstract_state.size
     with explained("quantities"):
-        wrong = [name for name, of in task.quantities.items() if not {*of} <= {*range(-size, size)}]
+        wrong = [name for name, of in task.quantities.items() if not {*map(index, of)} <= {*range(-size, size)}]
     if wrong:
         raise BadInputError(f"quantities: {', '.join(wrong)}: expected indices below {size}, of states")
 
@@ -123,8 +125,10 @@ def _simulator(task: Task, device: str) -> AbstractSimulator:
     what = f"make_simulator({_COUNT})"
     with explained(what):
         simulator = task.own_simulator(_COUNT, device)
-        state, taken = simulator.state, simulator.parameters.get("timestep_s", task.timestep_s)
-    if abs(taken / task.timestep_s - 1) > _MOST_APART:
+        state = simulator.state
+    with explained(f"{what}.parameters"):
+        taken = float(simulator.parameters.get("timestep_s", task.timestep_s))
+    if not abs(taken / task.timestep_s - 1) <= _MOST_APART:
         raise BadInputError(f"{what}: expected steps of timestep_s, {task.timestep_s:g} s, got steps of {taken:g} s")
     expect(f"{what}.state, {_COUNT} states at once", state, (_COUNT, task.abstract_state.size), torch.float32)
     return simulator
@@ -142,7 +146,7 @@ def _moved(task: Task, simulator: AbstractSimulator, starts: Tensor) -> Tensor:
             simulator.reset_to(*given)
             shown: object = simulator.state
         what = f"make_simulator: after reset_to({call}), state"
-        shown = expect(what, shown, tuple(expected.shape))
+        shown = expect(what, shown, tuple(expected.shape), torch.float32)
         if not torch.allclose(shown, expected, rtol=_TOLERANCE, atol=_TOLERANCE):
             apart = (shown - expected).abs()
             row, entry = (apart == apart.max()).nonzero()[0].tolist()
@@ -154,7 +158,7 @@ def _moved(task: Task, simulator: AbstractSimulator, starts: Tensor) -> Tensor:
     command = task.limits.in_units(torch.from_numpy(drawn).float()).to(starts.device)
     what = "make_simulator: step(command)"
     landed = stepped(simulator, command, what)
-    return expect(f"{what} of shape {tuple(command.shape)}", landed, tuple(starts.shape)).clone()
+    return expect(f"{what} of shape {tuple(command.shape)}", landed, tuple(starts.shape), torch.float32).clone()
 
 
 def _observation(task: Task, _: Tensor, state: Tensor, goal: Tensor) -> None:

@@ -22,14 +22,14 @@ class Axes:
     abstract_state = Column("abstract.state", size=2, names=("x", "y"), astra={"unit": ["m", "m"]})
     parameters = {"timestep_s": 0.1}
     def __init__(self, num_envs):
-        self.state = torch.zeros(num_envs, 2)
+        self.state, self.rate = torch.zeros(num_envs, 2), torch.nn.Parameter(torch.tensor(0.1))
     @staticmethod
     def abstraction(state):
         return state[:, :2]
     def reset_to(self, state, rows=None):
         self.state = state.clone() if rows is None else self.state.index_copy(0, rows, state)
     def step(self, action):
-        self.state = self.state + 0.1 * action
+        self.state = self.state + self.rate * action
         return self.state
 '''
 
@@ -155,10 +155,13 @@ def test_how_far_it_is_is_told(tmp_path: Path) -> None:
     assert lags > 1 and notes == expected
 
 
-@pytest.mark.parametrize(("falls", "explained"), [(5, 4), (11, 0)])
-def test_recordings_that_are_too_short_count_for_no_forecast(tmp_path: Path, falls: int, explained: int) -> None:
-    found = recorded(tmp_path, falls=falls)
+@pytest.mark.parametrize(("falls", "gains", "explained"), [(5, (0.9, 0.5), 4), (11, (0.9, 0.5), 0), (0, (1.0, 1.0), 0)])
+def test_recordings_that_are_too_short_and_simulators_that_do_not_err_count_for_no_forecast(
+    tmp_path: Path, falls: int, gains: tuple[float, float], explained: int
+) -> None:
+    found = recorded(tmp_path, falls=falls, gains=gains)
     assert found.recordings == 12 and len(found.explained) == explained and not found.forecast
+    assert any("too few recordings" in line.what for line in found.findings) == (falls > 0)
 
 
 def test_commands_that_only_vary_together_are_warned_of(tmp_path: Path) -> None:

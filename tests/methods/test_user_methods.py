@@ -276,7 +276,8 @@ from pydantic import BaseModel
 from astra_data.core.config import Config
 from astra_data.methods.astra import DIRECT_TRANSFER
 from astra_data.methods.method import Method, Table
-from astra_data.policies.train import UserLearner
+from astra_data.policies.train import InSimulator, UserLearner
+from astra_data.grounding.fit import HistoryFit
 from astra_data.grounding.simulator import FittedGrounding
 class Ours(Config):
     memory: int = 4
@@ -304,8 +305,19 @@ METHOD = Method(name="", title="",
         ),
         ("fit=fit, grounding=Half", "has a grounding, Half, without to_file, from_file"),
         ("learn=None, fit=fit, grounding=Half", "learns no policy.*; .*mine.py:METHOD has a grounding, Half, without"),
-        ("grounding=Whole", "has a grounding that nothing fits: expected fit"),
-        ("fit='fit'", "has fit='fit': expected a function"),
+        ("grounding=Whole, grounded_as='nas'", "has grounding, grounded_as, and nothing is fitted: expected fit"),
+        ("fit=fit, grounded_as='nas'", "is grounded as nas, which has another fit: expected the same"),
+        ("aligns=True", "has aligns, and nothing is fitted: expected fit"),
+        ("initial='nas', learn=fit", "starts from the policy of nas: expected a method that learns one, and fits n"),
+        ("fit='fit', learn=5", "has fit='fit': expected a function; .*mine.py:METHOD has learn=5: expected a function"),
+        ("table=Ours", "has table=<class '.*Ours'>: expected a Table of its name in recipes and the class of its"),
+        ("fit=HistoryFit(latent=True, reward=False, encoder=Kept())", "has an object as encoder: expected its class"),
+        ("fit=HistoryFit(latent=True, reward=False, encoder=Kept)", "has an encoder, Kept, without kind, a string, i"),
+        ("learn=InSimulator(reward='paid', ranges='all')", "has reward='paid': expected .*; .*has ranges='all': exp"),
+        (
+            "fit=HistoryFit(latent=True, reward=False), learn=InSimulator(reward='predicted')",
+            r"is paid a reward that nothing predicts: expected HistoryFit\(reward=True\)",
+        ),
         ("fit=fit, grounding=object(), table=Table('mine', Ours())", "has an object as grounding, table: expected its"),
         ("learn=UserLearner(learn=fit, policy=Kept())", "has an object as policy: expected its class"),
         ("learn=UserLearner(learn=fit, policy=Kept)", "learns a Kept, without kind, a string, act: expected the cl"),

@@ -48,6 +48,7 @@ def test_failures_are_told_apart_from_successes() -> None:
     task = TASKS["antmaze-umaze"]
     walls = replace(task.objective, ends_at_walls=True)
     simulator = NO_GROUNDING.simulator(task, 2)
+    simulator.simulator.period_s = torch.tensor(0.05, requires_grad=True)  # type: ignore[attr-defined] # as if learned
     env = BatchedVectorEnv(SeededSimulatorEnv(SimulatorEnv(walls, simulator)), max_episode_steps=200)
     env.reset(seed=0)
     commands = np.array([[0.0, 0.0], [-1.0, 1.0]], dtype=np.float32)

@@ -105,8 +105,9 @@ def test_the_price_of_failures_is_four_times_what_they_cost_as_far_as_it_has_gro
 
 @pytest.mark.parametrize(("risk", "share"), [(0.05, 0.05), (0.0, 0.0), (1.0, 1.0)])
 def test_failures_are_drawn_at_their_probability_and_end_episodes_that_did_not_succeed(
-    risk: float, share: float
+    risk: float, share: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(Navigation, "missed", Navigation.reached)  # who reaches a goal has not failed, as in targets
     count = 4000
     one = risky(count, risk, draws_failures=True)
     before, goal = one.simulator.state, one.goal

@@ -11,14 +11,15 @@ from astra_data.policies.episodes import in_target
 
 
 def test_robots_are_stepped_by_commands_in_their_units() -> None:
-    env = TASK.target(3, seed=0)
+    learned = torch.ones(1, requires_grad=True)
+    env = replace(TASK, abstraction=lambda state: state[..., :1] * learned).target(3, seed=0)
     env.reset()
     step = env.step(torch.tensor([[-1.0], [0.6], [1.0]]))
     # The middle is 1.5, half the range 2.5: -1, 3 and 4 m/s; the third is pushed too hard.
     torch.testing.assert_close(env.state, torch.tensor([[-0.09, -1.0], [0.27, 3.0], [0.36, 4.0]]))
     assert env.failed.tolist() == step.terminated.tolist() == [False, False, True]
     torch.testing.assert_close(step.reward, torch.tensor([-0.09, 0.27, 0.36 - 10.0]))
-    assert not step.success.any() and not env.wall_contact.any()
+    assert not step.success.any() and not env.wall_contact.any() and not step.reward.requires_grad
 
 
 def test_a_robot_that_fails_at_its_goal_does_not_succeed() -> None:

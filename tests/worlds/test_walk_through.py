@@ -85,6 +85,9 @@ class Own:
     def whole(self, state: Tensor, rows: Tensor | None = None) -> None:
         self.state = state if rows is None else self.state
 
+    def doubled(self, state: Tensor, rows: Tensor | None = None) -> None:
+        self.state = state.double()
+
     def lost(self, command: Tensor) -> Tensor:
         return Rail.step(self, command) * torch.nan  # type: ignore[arg-type]
 
@@ -144,7 +147,28 @@ WRONG: list[tuple[Task, str]] = [
     ),
     (
         objective(draw_starts=lambda self, rng, count: torch.zeros(count, 1)),
-        "objective.draw_starts(rng, 3): expected a NumPy array, got a Tensor",
+        "objective.draw_starts(rng, 3): expected a NumPy array of numbers, got a Tensor",
+    ),
+    (
+        replace(objective(draw_goals=lambda self, rng, count: np.array([["x"]] * count)), robot=None),
+        "objective.draw_goals(rng, 3): expected a NumPy array of numbers, got one of <U1",
+    ),
+    (simulator(parameters={"timestep_s": None}), "make_simulator(3).parameters fails with TypeError: float() argument"),
+    (
+        simulator(reset_to=Own.doubled),
+        "make_simulator: after reset_to(state), state: expected torch.float32, got torch.float64",
+    ),
+    (
+        simulator(step=lambda self, command: command.long()),
+        "make_simulator: step(command) of shape (3, 1): expected to",
+    ),
+    (
+        replace(TASK, quantities={"x": cast(Any, (0.0,))}),
+        "quantities fails with TypeError: 'float' object cannot be interpreted",
+    ),
+    (
+        replace(abstraction(lambda state: np.array(state[..., :1], object)), robot=None),
+        "abstraction (φ) of states (3, 2) fails with TypeError: can't convert np.ndarray of type numpy.object_",
     ),
     (
         replace(objective(draw_goals=lambda self, rng, count: np.zeros((count, 2))), robot=None),

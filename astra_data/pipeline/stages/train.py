@@ -62,10 +62,8 @@ def train(
         raise BadInputError(f"method '{method}' starts from the policy of {base.initial}: train that first")
     stopwatch = Stopwatch()
     episodes = PairedEpisodes.load(dataset, device)
-    episodes.check(world)
     sees_data = base.grounds or base.learns_from == "episodes" or config.data_start_share > 0
-    if sees_data and world.goal and not episodes.windows.goal.shape[-1]:
-        raise BadInputError(f"{episodes.reference} lacks the goals of {world.name}: run `astra-data label` first")
+    episodes.check(world, needs_goals=sees_data)
     grounding_file = grounding and grounding / GROUNDING
     initial_file = initial and initial / POLICY
     correction = grounding_at(grounding_file, device)

@@ -14,6 +14,7 @@ from astra_data.core.progress import Progress, silent
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.methods import METHODS
 from astra_data.methods.rma import RmaConfig
+from astra_data.pipeline.stages.ground import ground
 from astra_data.pipeline.stages.train import train
 from astra_data.policies.networks import ActorCritic, PolicyShape, SoftActor, Student
 from astra_data.policies.running_policy import PolicyFile
@@ -171,6 +172,8 @@ def test_data_without_goals_are_refused_where_policies_meet_them(
     ):
         with pytest.raises(BadInputError, match=r"lacks the goals of .*: run `astra-data label` first"):
             make(task, method, paired, grounding, tmp_path / "out", config)
+    with pytest.raises(BadInputError, match="lacks the goals"):
+        ground(task, "astra", dataset=paired, out=tmp_path / "out")
     assert make(task, "direct_transfer", paired, None, tmp_path / "out", from_the_start)
 
 
