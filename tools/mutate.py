@@ -98,13 +98,12 @@ def imported_by(test: Path) -> set[str]:
 def tests_of(path: Path) -> list[str]:
     """Return the mirrored test file, that of the room, and those that import the module at `path`."""
     module = ".".join(path.with_suffix("").parts).removesuffix(".__init__")
-    package, _, name = module.rpartition(".")
     folder = Path("tests", *path.parts[1:-1])
     found = [
         test for test in (folder / f"test_{path.name}", folder / f"test_{folder.name}.py") if (ROOT / test).exists()
     ]
     for test in sorted(ROOT.glob("tests/**/test_*.py")):
-        if any(one == f"{package}.{name}" or one.startswith(f"{module}.") for one in imported_by(test)):
+        if any(one == module or one.startswith(f"{module}.") for one in imported_by(test)):
             found.append(test.relative_to(ROOT))
     return [str(test) for test in dict.fromkeys(found)]
 

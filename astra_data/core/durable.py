@@ -152,12 +152,13 @@ def folder_for(target: Path) -> Iterator[None]:
 
 
 def write_file(path: Path, content: str | bytes) -> None:
-    """Write `path` atomically, replacing an older file, which stays after a DiskError; text becomes UTF-8."""
+    """Write `path`, or what it links to, atomically: an older file stays after a DiskError; text becomes UTF-8."""
     data = content.encode() if isinstance(content, str) else content
     if path.exists() and not path.is_file():  # such as /dev/stdout, which must not be replaced
         with writing(path):
             path.write_bytes(data)
         return
+    path = Path(os.path.realpath(path)) if path.is_symlink() else path
     with hidden_folder(path) as folder:
         partial = folder / path.name
         partial.write_bytes(data)

@@ -77,9 +77,10 @@ class Column:
         size, names, astra = self.size, self.names, self.astra or {}
         words = astra.get("role", [])
         unknown = ", ".join(sorted(set(words) - set(ROLES)))
-        is_named = "/" not in self.name and 1 <= len(self.name.encode(errors="replace")) <= MOST_NAME_BYTES
+        is_named = 1 <= len(self.name.encode(errors="replace")) <= MOST_NAME_BYTES
+        is_file = self.name not in (".", "..") and {"/", "\0"}.isdisjoint(self.name)
         checks = {
-            f"the name must have 1 to {MOST_NAME_BYTES} bytes, without '/'": is_named,
+            f"the name must have 1 to {MOST_NAME_BYTES} bytes, without '/', and name a file": is_named and is_file,
             f"dtype {self.dtype!r} is not one of {', '.join(DTYPES)}": self.dtype in DTYPES,
             f"size {size}, expected 1 to {MOST_VALUES}": 1 <= size <= MOST_VALUES,
             f"{len(names or ())} names for {size} values": names is None or len(names) == size,

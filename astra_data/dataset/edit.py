@@ -61,10 +61,11 @@ def subset(
     if (episodes is None) == (percent is None) or (of is not None and percent is None):
         raise BadInputError("a subset needs either a number of episodes or a percentage (optionally with --of)")
     available = len(source) - len(always)
-    count = episodes if percent is None else share(percent, of or available)
+    whole = available if of is None else of
+    count = episodes if percent is None else share(percent, whole)
     assert count is not None
     if not 1 <= count <= available:
-        wanted = f"{count} episodes" if percent is None else f"{percent} % of {of or available} = {count}"
+        wanted = f"{count} episodes" if percent is None else f"{percent} % of {whole} = {count}"
         raise BadInputError(
             f"{source.reference} has {available} episodes, but the subset has {wanted}: expected 1 "
             f"to {available}. Episodes are never repeated: collect or augment more, or give a smaller --of."

@@ -182,10 +182,10 @@ class Dataset:
     @cached_property
     def recordings(self) -> Ints:
         """The number of the recording that each episode is, or is a copy or a part of, (E,), from 0 on."""
-        sources, numbers = self.metadata.get("source_episode", [None] * len(self)), dict[int, int]()
+        sources, numbers = self.metadata.get("source_episode", [None] * len(self)), dict[Scalar, int]()
         of = {uid: uid if source is None else source for uid, source in zip(self.uids.tolist(), sources, strict=True)}
         # A copy may be of a part, as `trim` makes them.
-        return np.array([numbers.setdefault(int(of.get(source, source)), len(numbers)) for source in of.values()])
+        return np.array([numbers.setdefault(of.get(source, source), len(numbers)) for source in of.values()])
 
     @cached_property
     def held_out(self) -> Bools:

@@ -55,6 +55,7 @@ def trim(
             f"trim: expected a time of 0 s or more at the start or the end, --still or --without a condition, got {got}"
         )
     condition = _condition(source, without) if without else None
+    source.specs([names.STATE] if still else [])
     first, last = (round(seconds * source.info["fps"]) for seconds in (start_s, end_s))
     if not (first or last or still or without):
         raise BadInputError(f"trim: expected a step or more, {1 / source.info['fps']:g} s, got less")
@@ -197,8 +198,10 @@ def _resampled(episode: Episode, turns: Sequence[tuple[Column, _Turns]], before:
             elif is_clock(column):
                 of = np.concatenate([of, 2 * of[-1:] - of[-2:-1]]) if len(of) > 1 else of
             at = times_s[is_next : steps + is_next] * before - (is_next and column.name != names.NEXT_STATE)
-            found = _interpolated(as_rows(of).astype(np.float64), at, column, angles)
+            begin = of[0] if column.dtype == "int64" else 0  # from there on, float64 holds times of 2^53 and more
+            found = _interpolated(as_rows(of - begin).astype(np.float64), at, column, angles)
             found = found.reshape(steps, *values.shape[1:])
+            found = np.rint(found).astype(np.int64) + begin if column.dtype == "int64" else found
         else:
             found = values[np.minimum(np.maximum(row[:-1], row[1:] - 1) if is_next else row[:-1], len(episode) - 1)]
         columns[column.name] = found.astype(values.dtype)
@@ -230,10 +233,12 @@ def _interpolated(values: Floats, at: Floats, column: Column, turns: _Turns) -> 
     for role, part in column.roles:
         if role == "quaternion":
             second[:, part] *= np.where((first[:, part] * second[:, part]).sum(axis=1, keepdims=True) < 0, -1.0, 1.0)
-    found = np.where(share == 0.0, first, (1 - share) * first + share * second)
+    found = (1 - share) * first + share * second
     for role, part in column.roles:
         if role == "quaternion":
-            found[:, part] /= np.linalg.norm(found[:, part], axis=1, keepdims=True)
+            norm = np.linalg.norm(found[:, part], axis=1, keepdims=True)
+            found[:, part] /= np.where(norm > 0.0, norm, 1.0)
+    found = np.where(share == 0.0, first, found)
     for index, turn in turns.items():
         if (values[:, index] != recorded[:, index]).any():  # wrapped angles stay so
             least = 0.0 if recorded[:, index].min() >= 0.0 else -turn / 2

@@ -114,9 +114,10 @@ class Logs:
 
     @property
     def recorded_rate(self) -> float:
-        """Rows per second without gaps and repeated rows; `RATE_HZ` where the logs have no time."""
+        """Rows per second without gaps and repeated rows; `RATE_HZ` where there is no time, 0 where it stands still."""
         steps = np.concatenate([_steps(self.episodes, field) for field in self.of("time")] or [np.array([1 / RATE_HZ])])
-        return 1 / float(steps[(steps > 0) & (steps <= 1.5 * np.median(steps))].mean())
+        steps = steps[steps > 0]
+        return 1 / float(steps[steps <= 1.5 * np.median(steps)].mean()) if len(steps) else 0.0
 
     @property
     def rate(self) -> int:
@@ -317,7 +318,11 @@ def _roles(fields: Sequence[Field]) -> list[Field]:
 def _places(fields: Sequence[Field], episodes: Sequence[dict[str, Floats]]) -> list[Field]:
     """Return the fields, with latitude and longitude in m, and with offsets where float32 loses steps."""
     gps = {field.name: found for field in fields if (found := GPS.fullmatch(field.short))}
-    latitudes = {found["stem"]: name for name, found in gps.items() if found["axis"] == "lat"}
+    latitudes = {  # of the first episode that has any
+        found["stem"]: known[0]
+        for name, found in gps.items()
+        if found["axis"] == "lat" and (known := [one[name] for one in episodes if np.isfinite(one[name]).any()])
+    }
     pairs = {found["stem"] for found in gps.values() if found["axis"] != "lat"} & latitudes.keys()
     offsets: dict[str, float] = {}
     placed = {field.name: field for field in fields}
@@ -330,7 +335,7 @@ def _places(fields: Sequence[Field], episodes: Sequence[dict[str, Floats]]) -> l
         if at and at["stem"] in pairs:
             scale = METERS_PER_DEGREE * (degrees := 1e-7 if largest > 360 else 1.0)
             if at["axis"] != "lat":
-                scale *= math.cos(math.radians(float(np.nanmean(episodes[0][latitudes[at["stem"]]])) * degrees))
+                scale *= math.cos(math.radians(float(np.nanmean(latitudes[at["stem"]])) * degrees))
             why, offset = "degrees, to m from the first row", offsets.setdefault(at["axis"], -first * scale)
             placed[field.name] = replace(field, unit="m", scale=scale, offset=offset, why=why)
         elif place and field.unit == "m":

@@ -47,6 +47,16 @@ def test_what_is_no_plain_file_is_written_to_and_not_replaced(tmp_path: Path) ->
     assert os.read(reader, 100) == b"through"
     os.close(reader)
     assert fifo.is_fifo()
+    link, (reader, stdout) = tmp_path / "link", os.pipe()
+    (tmp_path / "stdout").symlink_to(f"/dev/fd/{stdout}")
+    durable.write_file(tmp_path / "stdout", "shown")
+    assert os.read(reader, 100) == b"shown"
+    os.close(reader)
+    os.close(stdout)
+    link.symlink_to("linked")
+    for text in ("first", "second"):
+        durable.write_file(link, text)
+        assert link.is_symlink() and (tmp_path / "linked").read_text() == text
     (tmp_path / "folder").mkdir()
     with pytest.raises(DiskError, match="is a directory"):
         durable.write_file(tmp_path / "folder", "text")

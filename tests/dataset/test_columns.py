@@ -27,6 +27,9 @@ def test_a_column_that_contradicts_itself_is_refused_with_every_fault() -> None:
     message = str(caught.value)
     for part in ("'/'", "float16", "1 names for 2", "1 words in astra's unit", "unknown role pos", "has 'x'"):
         assert part in message
+    for name in ("", ".", "..", "a\0", 201 * "a"):
+        with pytest.raises(BadInputError, match="the name must have 1 to 200 bytes, without '/', and name a file"):
+            keys.Column(name)
 
 
 def test_an_episode_makes_its_columns_contiguous_and_its_metadata_plain() -> None:
@@ -119,16 +122,3 @@ def test_a_uid_that_is_taken_is_replaced_by_one_that_is_free_and_fits_a_column()
     new = keys.new_uid(7, b"origin", {7})
     assert new != 7 and 0 <= new < 2**63 and new == keys.new_uid(7, b"origin", {7})
     assert new != keys.new_uid(7, b"another", {7}) and keys.new_uid(7, b"origin", {7, new}) not in {7, new}
-
-
-def test_metadata_name_the_episodes_by_their_new_uids() -> None:
-    """What a copy was made from is renamed with it; the uid that an episode had is kept beside."""
-    names = {1: 11, 2: 2}
-    assert keys.renamed_metadata(1, {"angle": 0.5, "source_episode": 1}, names) == {
-        "angle": 0.5,
-        "source_episode": 11,
-        "merged_uid": 1,
-    }
-    assert keys.renamed_metadata(2, {"source_episode": 1}, names) == {"source_episode": 11}
-    assert keys.renamed_metadata(2, {"source_episode": 5}, names) == {"source_episode": 5}
-    assert keys.renamed_metadata(2, {}, names) == {}

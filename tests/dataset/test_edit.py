@@ -54,9 +54,11 @@ def test_a_subset_of_a_subset_is_the_subset(forty: Dataset, tmp_path: Path) -> N
     assert uids(tmp_path / "a") != uids(subset(forty, episodes=7, out=tmp_path / "c"))
 
 
-def test_copies_of_a_recording_go_together(tmp_path: Path) -> None:
-    # Ten recordings, of each of which there are five copies.
-    facts = [{"source_episode": uid % 10} if uid >= 10 else {} for uid in range(60)]
+@pytest.mark.parametrize("are_named", [False, True])
+def test_copies_of_a_recording_go_together(tmp_path: Path, are_named: bool) -> None:
+    # Ten recordings, of each of which there are five copies, or six parts of logs with a name.
+    facts: list[dict[str, int | str]] = [{"source_episode": uid % 10} if uid >= 10 else {} for uid in range(60)]
+    facts = [{"source_episode": f"log_{uid % 10}"} for uid in range(60)] if are_named else facts
     copies = (replace(fake_episode(uid, 3), metadata=of) for uid, of in enumerate(facts))
     source, taken = write_fake(tmp_path / "copies", copies), set[int]()
     for episodes in (1, 14, 18, 36):
@@ -79,6 +81,8 @@ def test_percent_is_of_a_given_number_and_nothing_is_repeated(forty: Dataset, tm
         subset(forty, percent=150, out=tmp_path / "too-many")
     with pytest.raises(BadInputError, match="the subset has 0 episodes"):
         subset(forty, episodes=0, out=tmp_path / "none")
+    with pytest.raises(BadInputError, match="50 % of 0 = 0"):
+        subset(forty, percent=50, of=0, out=tmp_path / "none")
     with pytest.raises(BadInputError, match="either a number of episodes or a percentage"):
         subset(forty, episodes=3, percent=3, out=tmp_path / "both")
     with pytest.raises(BadInputError, match=r"a percentage \(optionally with --of\)"):

@@ -8,7 +8,7 @@ import pytest
 from astra_data.core.errors import CorruptDatasetError
 from astra_data.dataset import parquet
 from astra_data.dataset.columns import Array
-from astra_data.dataset.parquet import RotatingWriter, read_blocks, to_arrow, to_numpy
+from astra_data.dataset.parquet import read_blocks, to_arrow, to_numpy
 
 
 @pytest.mark.parametrize(
@@ -72,21 +72,3 @@ def test_only_wanted_rows_are_read(paths: list[Path], monkeypatch: pytest.Monkey
         tables = list(read_blocks(paths, ["x"], np.isin(np.arange(15), rows)))
         assert [x for table in tables for x in table.column("x").to_pylist()] == rows
         assert all(table.column_names == ["x"] for table in tables)
-
-
-def test_full_files_are_followed_by_the_next(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parquet, "FILE_SIZE_LIMIT", 1000)
-    monkeypatch.setattr(parquet, "CHUNK_SIZE", 2)
-    schema = pa.schema([("x", pa.float64())])
-    writer = RotatingWriter(tmp_path, "{chunk_index}/{file_index}.parquet", schema)
-    numbers = np.random.default_rng(0).random((5, 100))  # 800 bytes and more each
-    places = []
-    for row in numbers:
-        places.append(writer.locate())
-        writer.write(pa.table({"x": row}, schema=schema))
-    writer.close()
-    assert places == [(0, 0), (0, 0), (0, 1), (0, 1), (1, 0)]
-    files = [tmp_path / name for name in ("0/0.parquet", "0/1.parquet", "1/0.parquet")]
-    assert [pq.read_metadata(file).num_row_groups for file in files] == [2, 2, 1]
-    found = [x for file in files for x in pq.read_table(file).column("x").to_pylist()]
-    assert found == numbers.ravel().tolist()

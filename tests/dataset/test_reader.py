@@ -19,19 +19,15 @@ from astra_data.dataset.doctor.check import check
 from astra_data.dataset.doctor.repair import repair
 
 
-@pytest.mark.parametrize("block_rows", [1, 2**16])
-def test_columns_come_back_whole(fake: Dataset, monkeypatch: pytest.MonkeyPatch, block_rows: int) -> None:
+@pytest.mark.parametrize("block_rows", [1, 10, 2**16])
+def test_values_come_back_whole_and_episode_by_episode(
+    fake: Dataset, monkeypatch: pytest.MonkeyPatch, block_rows: int
+) -> None:
     monkeypatch.setattr(parquet, "BLOCK_ROWS", block_rows)
-    columns = fake.columns([column.name for column in COLUMNS])
-    for name, values in columns.items():
+    for name, values in fake.columns([column.name for column in COLUMNS]).items():
         expected = concatenated(name)
         assert values.dtype == expected.dtype and values.flags.c_contiguous
         np.testing.assert_array_equal(values, expected)
-
-
-@pytest.mark.parametrize("block_rows", [1, 10, 2**16])
-def test_episodes_come_back_one_by_one(fake: Dataset, monkeypatch: pytest.MonkeyPatch, block_rows: int) -> None:
-    monkeypatch.setattr(parquet, "BLOCK_ROWS", block_rows)
     found = list(fake.episodes())
     assert_same(found, fake_episodes())
     assert all(values.flags.writeable for episode in found for values in episode.columns.values())

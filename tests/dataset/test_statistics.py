@@ -5,12 +5,14 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from damaged import EPISODES
 from fake_dataset import concatenated, fake_episodes, write_fake
 
 from astra_data.dataset import statistics
 from astra_data.dataset.columns import ACTION, REWARD, STATE, SUCCESS, Array, Column
+from astra_data.dataset.doctor.check import check
 from astra_data.dataset.format import QUANTILES, STATISTICS
-from astra_data.dataset.statistics import EpisodeRows, Rounding, episode_statistics, pooled
+from astra_data.dataset.statistics import Rounding, episode_statistics, pooled
 
 NAMES = (STATE, ACTION, REWARD, SUCCESS, "mode")
 
@@ -37,6 +39,8 @@ def test_statistics_of_a_dataset_are_pooled_from_those_of_its_episodes(
 ) -> None:
     monkeypatch.setattr(statistics, "ROWS_AT_ONCE", rows_at_once)
     root = write_fake(tmp_path / "set").root
+    # No more rows than that are held in memory.
+    assert pq.read_metadata(root / EPISODES).num_row_groups == math.ceil(5 / rows_at_once) and not check(root).faults
     stats = json.loads((root / "meta/stats.json").read_text())
     for name in NAMES:
         expected = independent(concatenated(name))
@@ -52,7 +56,7 @@ def test_statistics_of_a_dataset_are_pooled_from_those_of_its_episodes(
 
 
 def test_episode_statistics_are_exact_to_the_precision_of_the_values(root: Path) -> None:
-    rows = pq.read_table(root / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    rows = pq.read_table(root / EPISODES).to_pylist()
     for row, episode in zip(rows, fake_episodes(), strict=True):
         for name in NAMES:
             assert row[f"stats/{name}/count"] == [len(episode)]
@@ -107,38 +111,3 @@ def test_steps_are_compared_with_those_that_float32_holds(monkeypatch: pytest.Mo
     assert told(2.0**20 + 100 * tiny) is not None and told(2.0**20 + 10 * tiny) is None  # the noise of float64
     monkeypatch.setattr(statistics, "_MOST_SAMPLES", 20)
     assert told(np.full(11, 2.0**24), *[2.0**24 + 0.3 * steps] * 2) is not None
-
-
-COLUMNS = [Column("state", size=2), Column("flag", "bool")]
-LENGTHS = (4, 1, 7)
-
-
-@pytest.mark.parametrize("rows_at_once", [1, 2, 1000])
-def test_rows_locate_the_episodes_and_hold_their_statistics(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rows_at_once: int
-) -> None:
-    monkeypatch.setattr(statistics, "ROWS_AT_ONCE", rows_at_once)
-    rng = np.random.default_rng(0)
-    data = [(rng.normal(size=(length, 2)).astype(np.float32), rng.random(length) < 0.5) for length in LENGTHS]
-    writer = EpisodeRows(tmp_path, COLUMNS, "walk", {})
-    for number, episode in enumerate(data):
-        writer.append(
-            len(episode[0]), chunk=number, file=10 + number, statistics=episode_statistics(episode), pictures={}
-        )
-    writer.close()
-    path = tmp_path / "meta/episodes/chunk-000/file-000.parquet"
-    # No more rows than that are held in memory.
-    assert pq.read_metadata(path).num_row_groups == math.ceil(3 / rows_at_once)
-    table = pq.read_table(path)
-    assert table.column("episode_index").to_pylist() == [0, 1, 2]
-    assert table.column("tasks").to_pylist() == [["walk"]] * 3 and table.column("length").to_pylist() == list(LENGTHS)
-    assert table.column("dataset_from_index").to_pylist() == [0, 4, 5]
-    assert table.column("dataset_to_index").to_pylist() == [4, 5, 12]
-    assert table.column("data/chunk_index").to_pylist() == [0, 1, 2]
-    assert table.column("data/file_index").to_pylist() == [10, 11, 12]
-    for row, (state, flag) in zip(table.to_pylist(), data, strict=True):
-        assert row["stats/state/count"] == row["stats/flag/count"] == [len(state)]
-        np.testing.assert_allclose(row["stats/state/mean"], state.astype(float).mean(0), rtol=6e-8)
-        np.testing.assert_allclose(row["stats/state/q90"], np.quantile(state.astype(float), 0.9, axis=0))
-        np.testing.assert_allclose(row["stats/flag/mean"], [flag.mean()])
-        assert row["stats/flag/max"] == [float(flag.any())]

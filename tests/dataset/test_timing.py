@@ -21,6 +21,7 @@ from astra_data.dataset.columns import (
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.timing import resample, trim
 
+EPOCH_NS = 1_700_000_000_123_456_789
 TURNS = {"unit": ["m", "rad", "1", "1", "1", "1"], "role": ["invariant", "heading", *["quaternion"] * 4]}
 
 
@@ -85,6 +86,9 @@ def test_still_ends_go_and_pauses_stay(tmp_path: Path) -> None:
     parts = (x[:-1], x[1:]), (np.zeros(3, np.float32),) * 2
     episodes = (Episode(uid, {STATE: now, NEXT_STATE: later}) for uid, (now, later) in enumerate(parts))
     logs = write_fake(tmp_path / "logs", episodes, columns=[Column(STATE), Column(NEXT_STATE)])
+    blind = write_fake(tmp_path / "blind", [Episode(0, {ACTION: x})], columns=[Column(ACTION)])
+    with pytest.raises(BadInputError, match=r"has no column observation\.state; it has action"):
+        trim(blind, still=True, out=tmp_path / "none")
     (found,) = made(trim(logs, still=True, out=tmp_path / "out"))
     assert found.columns[STATE].tolist() == [0, 1, 1] and found.columns[NEXT_STATE].tolist() == [1, 1, 2]
 
@@ -121,12 +125,20 @@ def turning(folder: Path, fps: int, steps: int) -> Dataset:
     last = np.arange(steps) == steps - 1
     columns = [Column(STATE, size=6, astra=TURNS), Column(NEXT_STATE, size=6, astra=TURNS), Column(ACTION)]
     columns += [Column(REWARD), Column(TERMINATED, "bool"), Column(SUCCESS, "bool"), Column("abstract.state")]
-    columns += [Column("time")]
+    columns += [
+        Column("time"),
+        Column("time_ns", "int64"),
+        Column("observation.off", size=4, astra={"role": TURNS["role"][2:]}),
+    ]
     values = {STATE: state[:-1], NEXT_STATE: state[1:], ACTION: np.arange(steps), REWARD: np.ones(steps)}
-    values |= {"abstract.state": np.zeros(steps), "time": 5 + time_s[:-1]}
-    flags = {TERMINATED: last, SUCCESS: last & False}
+    values |= {"abstract.state": np.zeros(steps), "time": 5 + time_s[:-1], "observation.off": np.zeros((steps, 4))}
+    others = {
+        TERMINATED: last,
+        SUCCESS: last & False,
+        "time_ns": EPOCH_NS + np.rint(1e9 * time_s[:-1]).astype(np.int64),
+    }
     floats = {name: value.astype(np.float32) for name, value in values.items()}
-    episode = Episode(3, floats | flags, {"return": float(steps), "success": False})
+    episode = Episode(3, floats | others, {"return": float(steps), "success": False})
     return write_fake(folder, [episode], columns=columns, fps=fps)
 
 
@@ -149,6 +161,8 @@ def test_states_at_another_rate_are_where_the_robot_was(
         np.testing.assert_allclose(w**2 + z**2, 1, atol=1e-5)
     np.testing.assert_array_equal(episode.columns[ACTION], np.floor(time_s * 50 + 1e-6))
     np.testing.assert_allclose(episode.columns["time"], 5 + time_s, atol=1e-5)
+    np.testing.assert_array_equal(episode.columns["time_ns"] - EPOCH_NS, np.rint(1e9 * time_s))
+    assert not episode.columns["observation.off"].any()
     assert episode.columns[REWARD].sum() == recorded == episode.metadata["return"]
     assert episode.columns[TERMINATED].tolist() == [*[False] * (len(episode) - 1), True]
     assert "abstract.state" not in found.features and caplog.messages[-1].endswith("abstract.state; pair it again")

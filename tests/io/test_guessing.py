@@ -132,9 +132,10 @@ def test_positions_keep_their_steps_in_float32(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.diff(stored), 0.01, rtol=1e-3)
 
 
-def test_degrees_north_and_east_become_meters(tmp_path: Path) -> None:
+@pytest.mark.parametrize("before", [[], [{"latitude": math.nan}]])  # where the first log has no fix
+def test_degrees_north_and_east_become_meters(tmp_path: Path, before: list[dict[str, float]]) -> None:
     east = {"longitude": 11 + RAMP / 1e4, "latitude": 60 - RAMP / 1e4, "cmd": RAMP}
-    values = found(tmp_path, east).episodes[0]
+    values = found(tmp_path, *(east | log for log in before), *[east] * 10).episodes[0]
     earth_m = 6_371_000 * math.tau / 360 / 1e4
     np.testing.assert_allclose(values["latitude"], -earth_m * RAMP, rtol=1e-4, atol=1e-4)
     np.testing.assert_allclose(values["longitude"], earth_m / 2 * RAMP, rtol=1e-4, atol=1e-4)
@@ -187,6 +188,11 @@ def test_rows_that_lack_a_number_are_left_out_and_counted(tmp_path: Path) -> Non
         (b"x,neigung_\xb0,cmd\n0,0,0\n1,1,1\n", "expected text in UTF-8, got the byte 0xb0: save it as UTF-8"),
         (b"t_s,x,cmd\n0,0,0\n0.4,1,1\n0.8,2,2\n", "t_s: expected rows per second within 10% of a whole number"),
         (b"run,x,cmd\n0,0,0\n1,1,1\n2,2,2\n", "found none: look at run, which cut or lack rows"),
+        (b'""\n1\n2\n', "log.csv: expected a header with a name for each field, got none: write one"),
+        (
+            b"t_s,x,cmd\n" + b"".join(b"%d,%d,\n" % (row, row) for row in range(20)) + b"19,20,1\n19,21,2\n",
+            "t_s: expected rows per second within 10% of a whole number, as fps is one, got 0:",
+        ),
         (
             b"t_s,x,cmd\n" + b"".join(b"%d,%d,%d\n" % (row // 2, row, row % 3) for row in range(20)),
             "t_s: expected a time that rises from row to row, got 10 rows in which it stands still and 0 in which",

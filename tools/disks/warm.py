@@ -27,8 +27,8 @@ from astra_data.core.provenance import git_commit, package_versions
 
 LIGHT = ("cli", "dataset", "io")
 """Rooms that commands on datasets need."""
-WITH_TORCH = ("dataset.frames", "dataset.samples", "dataset.step_windows", "io.hub.card", "io.hub.sharing")
-"""Modules of theirs that load torch: a process with torch takes several times as long to fork."""
+WITH_TORCH = "dataset.frames"
+"""The module of theirs that loads torch: a process with torch takes several times as long to fork."""
 LIBRARIES = ("pandas", "fsspec.implementations.local")
 
 _HDF5 = ctypes.CDLL(re.findall(r"/\S*libhdf5-\S+", Path("/proc/self/maps").read_text())[0])
@@ -67,7 +67,7 @@ def warm_up(*, light: bool) -> None:
     top = Path(astra_data.__path__[0])
     for path in sorted(top.rglob("*.py")):
         name = path.relative_to(top).with_suffix("").as_posix().replace("/", ".").removesuffix("__init__").rstrip(".")
-        is_wanted = name.startswith(LIGHT) and name not in WITH_TORCH if light else "ray" not in name
+        is_wanted = name.startswith(LIGHT) and name != WITH_TORCH if light else "ray" not in name
         if is_wanted and name:
             importlib.import_module(f"astra_data.{name}")
     for library in LIBRARIES if light else (*LIBRARIES, "minari", "matplotlib.backends.backend_agg"):

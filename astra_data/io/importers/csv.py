@@ -174,6 +174,8 @@ def texts_of(source: Source, fields: Sequence[str] = ()) -> tuple[dict[str, pa.S
         options = csv.ParseOptions(delimiter=delimiter_of(str(source)))
         header = csv.open_csv(io.BytesIO(content), parse_options=options).schema.names
         known = [name for name in header if name]
+        if not known:
+            raise BadInputError(f"{source}: expected a header with a name for each field, got none: write one")
         fields = fields or known
         row_count(str(source), fields, dict.fromkeys(header, (0,)))
         if doubled := sorted({name for name in fields if header.count(name) > 1}):
