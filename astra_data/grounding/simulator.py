@@ -96,7 +96,7 @@ class EpisodeSimulator:
         """Return all that `load_state_dict` needs to continue from here."""
         state = {"state": self.state}
         if self._varied is not None:
-            state |= {"true": self._varied.true_state, "parameters": self._varied.parameters}
+            state |= {"true": self._varied.simulator.state, "parameters": self._varied.parameters}
         if self._remembering is not None:
             state["memory"] = self._remembering.memory
         return state
@@ -105,7 +105,7 @@ class EpisodeSimulator:
         """Continue from `state`."""
         self.simulator.reset_to(state["state"])
         if self._varied is not None:
-            self._varied.true_state = state["true"].clone()
+            self._varied.simulator.reset_to(state["true"].clone())
             self._varied.parameters = state["parameters"].clone()
         if self._remembering is not None:
             self._remembering.memory = state["memory"].clone()

@@ -65,7 +65,7 @@ class Policy(nn.Module, ABC):
 
     def initial_hidden(self, count: int) -> Tensor:
         """Return the memory (count, M) at the start of an episode."""
-        return torch.zeros(count, self.shape.memory_size, device=next(self.parameters()).device)
+        return torch.zeros(count, self.shape.memory_size, device=next(self.parameters(), torch.empty(0)).device)
 
     def remember(self, observation: Tensor, previous_action: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
         """Process one step; return the features (B, F), and the next hidden (B, M)."""
@@ -318,10 +318,6 @@ class UserPolicy(Policy):
     def name(self) -> str:
         """The name of its class."""
         return type(self.acting).__name__
-
-    def initial_hidden(self, count: int) -> Tensor:
-        """Return no memory, (count, 0)."""
-        return torch.zeros(count, 0)
 
     def policy(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Return the actions (B, A) for observations (B, O), and a scale of 0."""

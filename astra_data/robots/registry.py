@@ -16,7 +16,7 @@ from astra_data.worlds.commands import Commands
 from astra_data.worlds.plane.mazes import Maze
 from astra_data.worlds.protocols import AbstractSimulator
 from astra_data.worlds.task import Task
-from astra_data.worlds.user_code import expect_tensor, explained, file_of, is_user_code, offered, user_object
+from astra_data.worlds.user_code import expect, explained, file_of, is_user_code, offered, user_object
 
 TASK_GROUP = "astra_data.tasks"  # the group of entry points under which installed packages offer tasks
 SIMULATOR_GROUP = "astra_data.simulators"  # likewise, of abstract simulators
@@ -110,11 +110,7 @@ def built(pairing: Pairing, count: int) -> AbstractSimulator:
     with explained(f"{pairing.id}({count})"):
         batch = pairing.simulator(count)
         parameters, state = dict(batch.parameters), batch.state
-        shape = tuple(state.shape)
-    expect_tensor(f"{pairing.id}({count}).state", state)
-    expected = (count, pairing.abstract_state.size)
-    if shape != expected:
-        raise BadInputError(f"{pairing.id}({count}).state has shape {shape}, expected {expected}")
+    expect(f"{pairing.id}({count}).state", state, (count, pairing.abstract_state.size))
     if faults := [key for key, value in parameters.items() if not isinstance(value, int | float | str)]:
         raise BadInputError(f"{pairing.id}.parameters: expected numbers or texts for {', '.join(faults)}")
     return batch

@@ -18,15 +18,11 @@ from astra_data.worlds.plane.mazes import Maze
 
 
 class FreeStates:
-    """B states (B, X) float32 in a space without obstacles."""
+    """B states (B, X) float32 in a space without obstacles; where a subclass has some, `blocked` (B,) bool says so."""
 
     def __init__(self, state: Tensor) -> None:
         self.state = state
-
-    @property
-    def blocked(self) -> Tensor:
-        """Which states were stopped by an obstacle: none, (B,) bool."""
-        return torch.zeros(len(self.state), dtype=torch.bool, device=self.state.device)
+        self.blocked = torch.zeros(len(state), dtype=torch.bool, device=state.device)
 
     def reset_to(self, state: Tensor, rows: Tensor | None = None) -> None:
         """Set the rows in `rows` (n,), by default all, to `state` (n, X)."""

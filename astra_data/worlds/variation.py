@@ -94,17 +94,8 @@ class VariedSimulator(ABC):
 
     @property
     def state(self) -> Tensor:
-        """The observed states, (B, X) float32; unless a subclass has sensors, the true ones."""
+        """The observed states, (B, X) float32; unless a subclass has sensors, the true ones of `simulator`."""
         return self.simulator.state
-
-    @property
-    def true_state(self) -> Tensor:
-        """The states themselves, (B, X) float32."""
-        return self.simulator.state
-
-    @true_state.setter
-    def true_state(self, state: Tensor) -> None:
-        self.simulator.reset_to(state)
 
     @property
     def blocked(self) -> Tensor:

@@ -172,25 +172,8 @@ def test_a_failure_models_memory_is_kept_and_forgotten_at_a_start() -> None:
     assert risk is not None and wanted is not None and not torch.allclose(risk, wanted)
 
 
-def plain(count: int) -> EpisodeSimulator:
-    one = EpisodeSimulator(PointMass(U_MAZE, count, timestep_s=0.05))
-    one.start(HERE.expand(count, 4), torch.arange(count), torch.zeros(count, 2))
-    return one
-
-
 def varied(count: int) -> EpisodeSimulator:
     return NO_GROUNDING.simulator(TASK, count, variation=TASK.varied.wide)
-
-
-def test_it_is_the_simulator_itself() -> None:
-    raw = PointMass(U_MAZE, 1, timestep_s=0.05)
-    raw.reset_to(HERE)
-    one = plain(1)
-    for _ in range(10):
-        action = torch.tensor([[0.3, 0.9]])
-        state = raw.step(action)
-        assert torch.equal(one.step(action), state) and torch.equal(one.state, state)
-        assert torch.equal(one.blocked, raw.blocked)
 
 
 def test_a_start_draws_the_parameters_of_its_rows_anew() -> None:
@@ -232,8 +215,8 @@ def test_a_saved_state_goes_on_with_its_parameters() -> None:
 
 def test_a_saved_state_holds_what_a_simulator_remembers() -> None:
     walker = TASKS["humanoid-walker2d"]
-    one = EpisodeSimulator(walker.simulator(2))
-    assert plain(1).state_dict().keys() == {"state"} and one.state_dict().keys() == {"state", "memory"}
+    one, plain = EpisodeSimulator(walker.simulator(2)), EpisodeSimulator(TASK.simulator(1))
+    assert plain.state_dict().keys() == {"state"} and one.state_dict().keys() == {"state", "memory"}
     memory = torch.rand_like(one.state_dict()["memory"])
     one.load_state_dict(one.state_dict() | {"memory": memory})
     assert torch.equal(one.state_dict()["memory"], memory)

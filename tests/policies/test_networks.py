@@ -32,17 +32,6 @@ def test_a_sequence_is_remembered_as_step_by_step(memory_size: int) -> None:
         torch.testing.assert_close(sequence, steps(policy, hidden))
 
 
-def test_a_start_empties_the_memory_of_its_row() -> None:
-    memory = policies(6)[0].memory
-    start = torch.zeros(3, 5)
-    start[1, 2] = 1.0
-    known, other = torch.randn(2, 3, 6)
-    ours, theirs = (networks.features_of(memory, OBSERVATION, ACTION, hidden, start) for hidden in (known, other))
-    torch.testing.assert_close(ours[1, 2:], theirs[1, 2:])
-    assert not torch.allclose(ours[1, :2], theirs[1, :2]) and not torch.allclose(ours[0], theirs[0])
-    assert torch.equal(networks.features_of(None, OBSERVATION, ACTION, known, start), OBSERVATION)
-
-
 def test_means_are_clipped_and_keep_the_gradient_of_what_is_not() -> None:
     output = torch.tensor([-7.0, -0.4, 0.9, 3.0], requires_grad=True)
     mean = networks.bounded(output)

@@ -11,18 +11,7 @@ from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError
 from astra_data.robots.ant.tasks import ant_model
 from astra_data.worlds.plane.mazes import U_MAZE
-from astra_data.worlds.simulators import BatchedPhysics, FreeStates, MujocoModel, NumpySimulator
-
-
-def test_states_are_set_row_by_row_and_those_handed_out_stay() -> None:
-    states = FreeStates(torch.zeros(3, 2))
-    before = states.state
-    states.reset_to(torch.ones(1, 2), torch.tensor([1]))
-    assert states.state.tolist() == [[0.0, 0.0], [1.0, 1.0], [0.0, 0.0]]
-    given = torch.full((3, 2), 5.0)
-    states.reset_to(given)
-    given.zero_()
-    assert states.state.unique().tolist() == [5.0] and before.unique().tolist() == [0.0]
+from astra_data.worlds.simulators import BatchedPhysics, MujocoModel, NumpySimulator
 
 
 def turn(state: Floats, command: Floats) -> Floats:

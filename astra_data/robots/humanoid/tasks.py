@@ -312,7 +312,7 @@ class VariedHumanoid(VariedSimulator):
     @property
     def state(self) -> Tensor:
         """The observed states, (B, X) float32."""
-        return self._scale * self.true_state
+        return self._scale * self.simulator.state
 
     def settle(self, before: Tensor, landed: Tensor) -> Tensor:
         """Move from `before` to where `landed` is observed, both (B, X); return the observed states."""

@@ -7,12 +7,13 @@ from astra_data.core.lazy import Tensor, torch
 from astra_data.worlds.geometry import turned
 from astra_data.worlds.plane.mazes import FreeSpace, Maze
 from astra_data.worlds.protocols import TaskSimulator
+from astra_data.worlds.simulators import FreeStates
 from astra_data.worlds.variation import Variation, VariedSimulator, noisy_command
 
 _CELLS_APART = 1e-6  # how far a radius may be from a whole number of cells, by rounding
 
 
-class PlanarStates:
+class PlanarStates(FreeStates):
     """B planar states (B, X) that begin with x, y, vx, vy of a disc among the walls of a maze, in m and m/s."""
 
     state_size: int
@@ -38,8 +39,7 @@ class PlanarStates:
         self._maze = maze
         self._settles_in: FreeSpace | None = None  # other than its own
         self.num_envs = num_envs
-        self.state = torch.zeros(num_envs, self.state_size, device=device)
-        self.blocked = torch.zeros(num_envs, dtype=torch.bool, device=device)
+        super().__init__(torch.zeros(num_envs, self.state_size, device=device))
         self.period_s: Tensor | float = timestep_s
         self._gain: Tensor | None = None
         self._heading_bias_rad = torch.zeros(())
@@ -59,8 +59,7 @@ class PlanarStates:
 
     def reset_to(self, state: Tensor, rows: Tensor | None = None) -> None:
         """Set the rows in `rows` (n,), by default all, to `state` (n, X)."""
-        # New tensors, so that callers can keep earlier ones.
-        self.state = state.clone() if rows is None else self.state.index_copy(0, rows, state)
+        super().reset_to(state, rows)
         if rows is not None:
             self.blocked = self.blocked.index_fill(0, rows, False)
 
@@ -96,7 +95,7 @@ class VariedPlanar(VariedSimulator):
     def reset_to(self, state: Tensor, rows: Tensor | None = None) -> None:
         """Set the true states in `rows` (n,), by default all, to `state` (n, X)."""
         self.simulator.reset_to(state, rows)
-        self._observed = self.true_state if rows is None else self._observed.index_copy(0, rows, state)
+        self._observed = self.simulator.state if rows is None else self._observed.index_copy(0, rows, state)
 
     def settle(self, before: Tensor, landed: Tensor) -> Tensor:
         """Move from `before` as far toward `landed`, both (B, X), as there is room; return where (B, X)."""

@@ -141,7 +141,7 @@ def test_the_largest_reset_error_of_all_blocks_is_recorded(
         (f"{MINE}:Exploding", r"stepped from φ\(s\) of step 0, gives x = .*: expected finite states"),
         (f"{MINE}:Greedy", r"abstraction of Greedy, given states \(\d+, 29\), fails with IndexError"),
         (f"{MINE}:Clumsy", r"Clumsy\(4096\) fails with TypeError"),
-        (f"{MINE}:Narrow", r"Narrow\(4096\).state has shape \(4096, 1\), expected \(4096, 2\)"),
+        (f"{MINE}:Narrow", r"Narrow\(4096\).state: expected shape \(4096, 2\), got \(4096, 1\)"),
         (f"{MINE}:Bare", r"Bare.parameters: expected numbers or texts for maze"),
         (f"{MINE}:Squeezing", r"step of Squeezing returns shape \(4096, 1\), expected \(4096, 2\)"),
         ("antmaze-long", r"was collected for antmaze-short, which has another maze .*: give --simulator"),

@@ -113,7 +113,7 @@ def test_sensors_show_other_states_than_the_true_ones() -> None:
     varied.reset_to(here)
     assert torch.equal(varied.state, here)
     shown = torch.stack([varied.step(torch.zeros(3, 3)) for _ in range(500)]) - here
-    assert torch.equal(varied.true_state, here) and torch.equal(inner.state, here)
+    assert torch.equal(varied.simulator.state, here) and torch.equal(inner.state, here)
     expected = torch.tensor([0.1, 0.1, 0.2, 0.2, 0.3, 0.3, 0.4, 0.4])
     torch.testing.assert_close(shown.amax((0, 1)), expected, atol=0, rtol=0.03)
     torch.testing.assert_close(shown.amin((0, 1)), -expected, atol=0, rtol=0.03)
@@ -121,7 +121,7 @@ def test_sensors_show_other_states_than_the_true_ones() -> None:
     before = varied.state
     varied.reset_to(torch.zeros(1, 8), torch.tensor([1]))
     assert torch.equal(varied.state, torch.stack([before[0], torch.zeros(8), before[2]]))
-    assert torch.equal(varied.true_state, torch.stack([here[0], torch.zeros(8), here[2]]))
+    assert torch.equal(varied.simulator.state, torch.stack([here[0], torch.zeros(8), here[2]]))
 
 
 START = torch.tensor([[-4.0, 4.0, 0.0, 0.0]])
@@ -155,7 +155,7 @@ def test_the_plain_point_mass_does_these_operations_in_this_order() -> None:
 
 def test_each_parameter_does_what_its_name_says() -> None:
     plain = one_step(PlanarVariation())
-    assert torch.equal(plain.state[0, 2:], plain.true_state[0, 2:])
+    assert torch.equal(plain.state[0, 2:], plain.simulator.state[0, 2:])
     for variation, velocity, moved in (
         (PlanarVariation(friction=(0.5, 0.5)), [0.3, -0.4], [0.015, -0.02]),
         (PlanarVariation(action_scale=(0.5, 0.5)), [0.9, -1.2], [0.045, -0.06]),
@@ -170,5 +170,5 @@ def test_each_parameter_does_what_its_name_says() -> None:
 def test_noise_on_commands_moves() -> None:
     torch.manual_seed(0)
     noisy = one_step(PlanarVariation(action_noise=(0.1, 0.1)), 20_000, 0.5 * ACTION)
-    assert torch.equal(noisy.state, noisy.true_state)
+    assert torch.equal(noisy.state, noisy.simulator.state)
     torch.testing.assert_close(noisy.state[:, 2:].std(0), torch.full((2,), 0.1), atol=0.005, rtol=0)
