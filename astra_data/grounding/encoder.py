@@ -241,4 +241,4 @@ def take_scales(network: nn.Module, values: Mapping[str, Tensor]) -> None:
     for name, seen in values.items():
         if seen.numel():
             getattr(network, f"{name}_mean").copy_(seen.mean(0))
-            getattr(network, f"{name}_std").copy_(seen.std(0).clamp_min(_LEAST))
+            getattr(network, f"{name}_std").copy_(seen.std(0, correction=min(1, len(seen) - 1)).clamp_min(_LEAST))

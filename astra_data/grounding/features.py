@@ -35,7 +35,6 @@ class PictureEncoder(Protocol):
 
     def __call__(self, pictures: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Return the features (B, size) of pictures (B, H, W, 3)."""
-        ...
 
 
 class ColorPlaces:

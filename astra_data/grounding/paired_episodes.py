@@ -114,8 +114,9 @@ class PairedEpisodes:
         commands = Commands({name: tuple(ends) for name, ends in bounds.items()}) if bounds else None
         padded = {}
         for name, values in columns.items():
-            steps = torch.from_numpy(values if values.dtype == bool else values.astype("float32", copy=False))
-            if name not in (names.REWARD, names.TERMINATED, names.SUCCESS):
+            is_outcome = name in (names.TERMINATED, names.SUCCESS)  # of logs, it may be a number
+            steps = torch.from_numpy(values.astype(bool if is_outcome else np.float32, copy=False))
+            if name != names.REWARD and not is_outcome:
                 steps = steps.reshape(len(steps), -1)
             if name == names.ACTION and commands is not None:
                 steps = commands.normal(steps)

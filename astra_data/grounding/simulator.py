@@ -21,7 +21,6 @@ class LatentEncoder(Protocol):
 
     def encoder_input(self, state: Tensor, goal: Tensor, previous_action: Tensor) -> Tensor:
         """Assemble the encoder's input (..., I) of states, goals and the actions that led there."""
-        ...
 
 
 class EpisodeSimulator:

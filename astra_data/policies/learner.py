@@ -22,7 +22,6 @@ class ActingPolicy(Protocol):
 
     def act(self, observation: NDArray[Any]) -> NDArray[Any]:
         """Return actions (B, A) within ±1 for observations (B, O) float32."""
-        ...
 
 
 class SavedPolicy(ActingPolicy, Protocol):
@@ -32,12 +31,10 @@ class SavedPolicy(ActingPolicy, Protocol):
 
     def to_file(self) -> tuple[Mapping[str, Tensor], dict[str, Any]]:
         """Return tensors, at least one, and metadata (JSON values) from which `from_file` rebuilds it."""
-        ...
 
     @classmethod
     def from_file(cls, tensors: dict[str, Tensor], metadata: Mapping[str, Any]) -> Self:
         """Rebuild it."""
-        ...
 
 
 PACKAGE_KINDS = ("actor_critic", "adaptive", "soft_actor")  # what files call the networks of the package

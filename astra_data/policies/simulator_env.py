@@ -96,8 +96,9 @@ class SimulatorEnv:
 
     def _start_task(self, rows: Tensor) -> None:
         rng = np.random.default_rng(int(torch.randint(2**62, ())))
-        state = self._tensor(self.objective.draw_starts(rng, len(rows)))
-        self._start(state, self._tensor(self.objective.draw_goals(rng, len(rows))), rows)
+        if len(rows):  # a user's objective need not know what none is
+            state = self._tensor(self.objective.draw_starts(rng, len(rows)))
+            self._start(state, self._tensor(self.objective.draw_goals(rng, len(rows))), rows)
 
     def start_from(self, state: Tensor, goal: Tensor) -> None:
         """Start an episode in each row, from states (B, X) with goals (B, G)."""

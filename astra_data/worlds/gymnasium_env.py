@@ -80,7 +80,7 @@ class GymnasiumRobot:
         self._read_state, self._command, self._failed = read_state, command, failed
         self.any_end_fails = failed is None
         if isinstance(space := self.env.action_space, gymnasium.spaces.Box):
-            slack = _SLACK * (space.high - space.low)
+            slack = np.nan_to_num(_SLACK * (space.high - space.low), posinf=0.0)
             self._least, self._largest = space.low - slack, space.high + slack
 
     def reset(self, seed: int | None = None) -> State:

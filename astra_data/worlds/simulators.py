@@ -120,7 +120,7 @@ def physics_state() -> int:
 def add_walls(world: ElementTree.Element, maze: Maze, height: float, **attributes: str) -> None:
     """Add a box of `height` m for each wall cell of `maze` to the body `world` of a model's XML."""
     half = 0.5 * maze.scale
-    for row, column in maze.wall_cells():
+    for row, column in maze.cells(walls=True):
         x, y = maze.cell_center(row, column)
         box = {"name": f"block_{row}_{column}", "type": "box", "size": f"{half} {half} {height / 2}"}
         ElementTree.SubElement(world, "geom", {**box, "pos": f"{x} {y} {height / 2}", **attributes})

@@ -486,7 +486,7 @@ def astra(dataset, task, seed=0):
     torch.manual_seed(seed)
     episodes = load_episodes(dataset, task)
     order = torch.randperm(len(episodes["lengths"]))
-    held_out, training = (selected(episodes, rows) for rows in order.tensor_split([len(order) // 10]))
+    held_out, training = (selected(episodes, rows) for rows in order.tensor_split([max(1, len(order) // 10)]))
     model = ground(training, held_out)
     policy, target = train(task, model, training), align(model, training, held_out)
     by_target = success_in_target(task, policy, target, lambda state: state)

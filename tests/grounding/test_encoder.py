@@ -190,6 +190,8 @@ def test_target_encoder_clips_normalized_states() -> None:
     torch.testing.assert_close(inputs[:, :3].std(0), torch.ones(3), atol=0.01, rtol=0)
     far = encoder.encoder_input(torch.full((1, 3), 1e6), goal[:1] - 1e6, torch.zeros(1, 1))
     assert far[0, :3].tolist() == pytest.approx([5.0] * 3) and far[0, 11:13].tolist() == [-5.0] * 2
+    encoder.set_scales(state[:1], goal[:1])  # one step has no deviation
+    assert encoder.state_std.tolist() == pytest.approx([1e-3] * 3)
 
 
 def test_target_encoder_does_not_see_what_it_shall_not() -> None:

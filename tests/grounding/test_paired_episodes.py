@@ -38,7 +38,8 @@ def write(
     commands: dict[str, tuple[float, float]] | None = None,
     lacks: str = "",
 ) -> Path:
-    outcomes = [column for column in keys.OUTCOME_COLUMNS if column.name != lacks]
+    given = (*keys.OUTCOME_COLUMNS[:-1], keys.Column(keys.SUCCESS))  # a number, as of logs
+    outcomes = [column for column in given if column.name != lacks]
     columns = [*(keys.Column(name, size=size) for name, size in sizes.items()), *outcomes]
     description = {"name": "toy", "stage": "pair", "config": {}, "seeds": {"collect": 0}}
     simulator = {"id": "toy"} | ({"commands": commands} if commands else {})
@@ -56,7 +57,7 @@ def write(
                 values[keys.NEXT_STATE] = values[keys.STATE] + moved[:, None]
             metadata: dict[str, int] = {} if held_out is None else {"held_out": episode in held_out}
             metadata |= {"source_episode": sources[episode]} if sources and episode in sources else {}
-            values |= {keys.SUCCESS: last & (episode == 2)}
+            values |= {keys.SUCCESS: (last & (episode == 2)).astype(np.float32)}
             values.pop(lacks, None)
             writer.add(keys.Episode(episode, values, metadata))
     return folder

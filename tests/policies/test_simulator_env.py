@@ -194,7 +194,7 @@ def test_parameters_of_the_episode_are_observed_where_asked_for() -> None:
     assert torch.equal(showing.load_state_dict(showing.state_dict()), after)
 
 
-def test_recorded_starts_hand_over_their_history() -> None:
+def test_recorded_starts_hand_over_their_history(monkeypatch: pytest.MonkeyPatch) -> None:
     torch.manual_seed(0)
     model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8)).requires_grad_(False)
     state, goal = torch.tensor([[4.0, 0.0, 0.1, -0.9]]), torch.tensor([[-4.2, -4.1]])
@@ -202,6 +202,7 @@ def test_recorded_starts_hand_over_their_history() -> None:
     grounded = HistoryGrounding(model).corrected(PointMass(U_MAZE, 3, timestep_s=0.05))
     world = simulator_env.WorldConfig(data_start_share=1.0, change_penalty=0.1)
     one = simulator_env.SimulatorEnv(NAVIGATION, grounded, world, starts=starts)
+    monkeypatch.delattr(Navigation, "draw_starts")  # there are none to draw
     one.reset()
     assert torch.equal(one.state_dict()["command"], starts.previous_action.expand(3, 2))
     assert starts.hidden is not None

@@ -127,6 +127,9 @@ def test_commands_that_are_no_actions_are_refused() -> None:
         robot.check_commands(Commands({"torque": (-2.1, 2.0)}))
     with pytest.raises(BadInputError, match=r"-2 to 2 in entry 0, and the command is 2\.1"):
         robot.check_commands(Commands({"torque": (-2.0, 2.1)}))
+    ahead = type("Ahead", (Corridor,), {"action_space": gymnasium.spaces.Box(0.0, np.inf, (1,))})
+    with pytest.raises(BadInputError, match=r"takes actions of 0 to inf in entry 0, and the command is -1: nar"):
+        GymnasiumRobot(ahead).check_commands(Commands({"v": (-1.0, 1.0)}))
     two = Commands({"v": (-1.0, 1.0), "w": (-1.0, 1.0)})
     with pytest.raises(BadInputError, match=r"Pendulum-v1 takes actions of shape \(1,\), got \(2,\): give"):
         robot.check_commands(two)

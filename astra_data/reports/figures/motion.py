@@ -70,7 +70,7 @@ def trajectories(results: Results, scene: Scene) -> Figure | None:
     points = np.concatenate([*found, np.empty((0, 2))])
     if not np.isfinite(points).any():
         return None
-    points = np.array([maze.cell_center(*cell) for cell in maze.free_cells()]) if maze else points
+    points = np.array([maze.cell_center(*cell) for cell in maze.cells(walls=False)]) if maze else points
     low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
     # Part of the outer walls, or a tenth of the larger side.
     rim = (0.5 + RIM) * maze.scale if maze else max(0.1 * float((high - low).max()), 0.1)
@@ -201,7 +201,7 @@ def _cell_means(maze: Maze, goals: Floats) -> Iterator[Floats]:
 
 def draw_walls(axes: Axes, maze: Maze) -> None:
     """Draw the walls of a maze, and no axes."""
-    half, centers = maze.scale / 2, [maze.cell_center(*cell) for cell in maze.wall_cells()]
+    half, centers = maze.scale / 2, [maze.cell_center(*cell) for cell in maze.cells(walls=True)]
     cells = [Rectangle((x - half, y - half), maze.scale, maze.scale) for x, y in centers]
     # The thin edge in the wall's own color closes the hairlines between neighboring cells.
     axes.add_collection(PatchCollection(cells, fc=WALL, ec=WALL, lw=0.5, zorder=1))

@@ -70,12 +70,6 @@ def knock(before: Tensor, after: Tensor, ball: Tensor, velocity: Tensor, contact
     return torch.where(touched, after + direction * contact.reach_m, ball), torch.where(touched, leaving, velocity)
 
 
-def kick_away(body: Tensor, ball: Tensor, velocity: Tensor, asked: Tensor, contact: Contact) -> Tensor:
-    """Return the velocities (B, 2) of balls, of which bodies that are `asked` (B, 1) kick those within reach."""
-    _, within, leaving = contact.of(body, ball)
-    return torch.where(asked & within, leaving, velocity)
-
-
 class BallAgent(PlanarStates):
     """B point masses, each with a ball: [x, y, vx, vy, ball x, ball y, ball vx, ball vy], in m and m/s.
 
@@ -131,7 +125,8 @@ class BallAgent(PlanarStates):
         way = ~kicks * self.commanded_velocity(action[:, :2]) * self.period_s
         moved, self.blocked = self.free.slide(position, position + way)
         ball, velocity = knock(position, moved, ball, velocity, Contact(of["reach_m"], of["knock_m_s"], turn))
-        velocity = kick_away(moved, ball, velocity, kicks, Contact(of["kick_reach_m"], of["kick_m_s"], turn))
+        _, within, leaving = Contact(of["kick_reach_m"], of["kick_m_s"], turn).of(moved, ball)
+        velocity = torch.where(kicks & within, leaving, velocity)
         self._rolls = velocity.norm(dim=-1, keepdim=True) > _LIES_M_S
         ball, velocity = roll(ball, velocity, self.period_s, self._deceleration_m_s2)
         self.state = torch.cat([moved, (moved - position) / self.period_s, ball, velocity], dim=-1)

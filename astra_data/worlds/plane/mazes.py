@@ -31,7 +31,7 @@ class Maze:
             faults += [
                 f"{name}: expected (row, column) of a free cell, got {cell}"
                 for name, cell in (("start", self.start), ("goal", self.goal))
-                if cell not in self.free_cells()
+                if cell not in self.cells(walls=False)
             ]
         per_cell = self.scale / self.fine_m if self.fine_m > 0 else 0.0
         if self.scale <= 0 or round(per_cell) < 2 or abs(per_cell - round(per_cell)) > 1e-6:
@@ -55,13 +55,9 @@ class Maze:
         half_width, half_height = self.half_extent
         return (column + 0.5) * self.scale - half_width, half_height - (row + 0.5) * self.scale
 
-    def wall_cells(self) -> list[tuple[int, int]]:
-        """Return the (row, column) of every wall cell, row by row."""
-        return [(int(row), int(column)) for row, column in np.argwhere(self.walls)]
-
-    def free_cells(self) -> list[tuple[int, int]]:
-        """Return the (row, column) of every free cell, row by row."""
-        return [(int(row), int(column)) for row, column in np.argwhere(~self.walls)]
+    def cells(self, *, walls: bool) -> list[tuple[int, int]]:
+        """Return the (row, column) of every cell that is wall, or of every free one, row by row."""
+        return [(int(row), int(column)) for row, column in np.argwhere(self.walls == walls)]
 
     @cached_property
     def fine_walls(self) -> Bools:

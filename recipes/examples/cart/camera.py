@@ -92,14 +92,14 @@ def deliver(policy, see, trials=100, seed=0):
 
 def play(run, trials=100):
     """Print which share of its trials each policy of a run delivers, and tips."""
-    for trained in sorted((Path(run) / "train").glob("*/seed_*")):
+    for trained in sorted((Path(run) / "train").glob("*/seed_*")) or sys.exit(f"{run}: expected trained policies"):
         row, seed = trained.parent.name, int(trained.name.removeprefix("seed_"))
         print(f"{row}, seed {seed}: {deliver(load_policy(run, row, seed=seed), seen, trials)}")
 
 
 def compare(run, out):
     """Print how policies of a run do by pictures and by states, with either encoder; ψ^t of states goes to `out`."""
-    for seen_by in sorted((Path(run) / "align/astra").glob("seed_*")):
+    for seen_by in sorted((Path(run) / "align/astra").glob("seed_*")) or sys.exit(f"{run}: expected ψ^t of astra"):
         seed, aligned = int(seen_by.name.removeprefix("seed_")), Path(out) / seen_by.name
         if not aligned.exists():
             pairs, grounding = Path(run) / f"pair/{seen_by.name}", Path(run) / f"ground/astra/{seen_by.name}"
@@ -117,7 +117,7 @@ def compare(run, out):
 
 
 if __name__ == "__main__":
-    command, *rest = sys.argv[1:]
+    command, *rest = sys.argv[1:] or sys.exit(__doc__)
     if command == "compare":
         compare(*rest)
     elif command == "play":

@@ -76,7 +76,7 @@ def record(folder, drives=60, seconds=15, seed=0):
 
 def play(run, trials=100, seed=0):
     """Print which share of its trials each policy of a run delivers, and tips."""
-    for trained in sorted((Path(run) / "train").glob("*/seed_*")):
+    for trained in sorted((Path(run) / "train").glob("*/seed_*")) or sys.exit(f"{run}: expected trained policies"):
         row, its_seed = trained.parent.name, int(trained.name.removeprefix("seed_"))
         policy, rng = load_policy(run, row, seed=its_seed), np.random.default_rng(seed)
         carts = [TrueCart() for _ in range(trials)]
@@ -93,7 +93,7 @@ def play(run, trials=100, seed=0):
 
 
 if __name__ == "__main__":
-    command, *rest = sys.argv[1:]
+    command, *rest = sys.argv[1:] or sys.exit(__doc__)
     if command == "play":
         play(rest[0], *map(int, rest[1:]))
     else:

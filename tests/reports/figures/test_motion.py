@@ -97,7 +97,7 @@ def test_trajectories_draw_a_panel_per_method_with_crosses_where_episodes_fail(s
     assert sum(line.get_marker() == "*" for line in astra.lines) == 1
     assert not [line for line in follower.lines if line.get_color() == SIMULATED]
     (walls,) = astra.collections
-    assert len(walls.get_paths()) == len(U_MAZE.wall_cells())
+    assert len(walls.get_paths()) == len(U_MAZE.cells(walls=True))
     named = replace(scene, methods=("astra", "nas"))
     assert len(drawn(trajectories(results("astra", "follower"), named)).axes) == 1
 

@@ -60,7 +60,7 @@ def test_walls_are_gymnasium_robotics_own() -> None:
     assert names == {theirs.geom(geom).name for geom in range(theirs.ngeom)} - {
         ours.geom(geom).name for geom in range(ours.ngeom) if not walls[0] <= geom <= walls[1]
     }
-    assert len(names) == len(U_MAZE.wall_cells())
+    assert len(names) == len(U_MAZE.cells(walls=True))
     for name in names:
         for field in ("pos", "size", "type", "contype", "conaffinity", "friction", "solref", "margin"):
             np.testing.assert_array_equal(getattr(ours.geom(name), field), getattr(theirs.geom(name), field))

@@ -33,17 +33,12 @@ def test_a_body_knocks_its_ball_away_along_the_line_between_them() -> None:
     assert torch.equal(beside, place) and turned[0].tolist() == pytest.approx([0.0, 0.7], abs=1e-6)
 
 
-def test_a_kick_sends_balls_within_reach_straight_away() -> None:
-    bodies = torch.zeros(4, 2)
-    ball = torch.tensor([[0.18, 0.24], [0.18, 0.24], [0.3, 0.4], [-0.3, 0.0]])
-    rolling = torch.tensor([[0.1, 0.2]]).expand(4, 2)
-    asked = kicking.asks_to_kick(torch.tensor([[0.9, 0.9, 0.6], [0.9, 0.9, 0.5], [0.0, 0.0, 1.0], [0.0, 0.0, 1.0]]))
-    velocity = kicking.kick_away(bodies, ball, rolling, asked, kicking.Contact(0.35, 2.0))
-    # Kicked; not asked to; out of reach; behind, which a body without a heading kicks as well.
-    torch.testing.assert_close(velocity, torch.tensor([[1.2, 1.6], [0.1, 0.2], [0.1, 0.2], [-2.0, 0.0]]))
-    quarter = torch.full((4,), torch.pi / 2)
-    turned = kicking.kick_away(bodies, ball, rolling, asked, kicking.Contact(0.35, 2.0, quarter))
-    torch.testing.assert_close(turned[[0, 3]], torch.tensor([[-1.6, 1.2], [0.0, -2.0]]))
+def test_balls_within_reach_leave_straight_away_or_turned_and_more_than_a_half_asks_for_it() -> None:
+    ball = torch.tensor([[0.18, 0.24], [0.3, 0.4], [-0.3, 0.0]])
+    assert kicking.asks_to_kick(torch.tensor([[0.9, 0.9, 0.6], [0.9, 0.9, 0.5]])).tolist() == [[True], [False]]
+    for turn_rad, expected in ((0.0, [1.2, 1.6]), (torch.full((3,), torch.pi / 2), [-1.6, 1.2])):
+        _, within, leaving = kicking.Contact(0.35, 2.0, turn_rad).of(torch.zeros(3, 2), ball)
+        assert within[:, 0].tolist() == [True, False, True] and leaving[0].tolist() == pytest.approx(expected)
 
 
 def test_commands_without_a_wish_to_kick_are_refused() -> None:
