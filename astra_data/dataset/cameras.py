@@ -7,7 +7,8 @@ with it, unless that is longer than `MOST_EXTRA_S`; then its frames are encoded 
 """
 
 import io
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property, lru_cache
@@ -20,9 +21,17 @@ from numpy.typing import NDArray
 from astra_data.core.durable import file_digest
 from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.dataset import format as layout
-from astra_data.dataset.columns import Clip
+from astra_data.dataset.columns import EPISODE_INDEX, INDEX, Clip
 from astra_data.dataset.parquet import read_blocks
-from astra_data.dataset.plain import episodes_files, is_data_path, is_format_2, read_footer, read_object, read_places
+from astra_data.dataset.plain import (
+    Run,
+    episodes_files,
+    is_data_path,
+    is_format_2,
+    read_footer,
+    read_object,
+    read_places,
+)
 
 MOST_EXTRA_S = 1.0
 _ENCODERS = {"av1": "libsvtav1", "h264": "libx264", "hevc": "libx265"}
@@ -31,10 +40,11 @@ _OPTIONS = {"g": "2", "crf": "23"}  # key frames as dense as lerobot's, so that 
 
 
 class Camera(NamedTuple):
-    """LeRobot's feature of a camera, and a clip for each episode."""
+    """LeRobot's feature of a camera, the clips of episodes by their numbers, and why those of others are not known."""
 
     feature: Mapping[str, Any]
-    clips: Sequence[Clip]
+    clips: Mapping[int, Clip]
+    fault: str = ""
 
 
 class Span(NamedTuple):
@@ -115,65 +125,99 @@ def _index(path: Path, digest: str | None, _changed_ns: int) -> _Index:
     return found
 
 
-def read_cameras(root: Path, info: Mapping[str, Any]) -> tuple[dict[str, Camera], dict[str, str]]:
-    """Return the cameras of the LeRobot dataset in `root`, and what is wrong with those that cannot be read."""
-    cameras, faults, described = dict[str, Camera](), dict[str, str](), read_object(root / layout.DATASET_PATH)
+def read_cameras(root: Path, info: Mapping[str, Any]) -> dict[str, Camera]:
+    """Return the cameras of the LeRobot dataset in `root`, with the clips that its metadata tell."""
+    cameras, described = dict[str, Camera](), read_object(root / layout.DATASET_PATH)
     digests = {} if isinstance(described, str) else described.get("videos", {})
     features = info["features"] if isinstance(info.get("features"), Mapping) else {}
     for name, feature in features.items():
-        if isinstance(feature, Mapping) and (kind := feature.get("dtype")) in ("video", "image"):
-            try:
-                clips = _of_format_2 if is_format_2(root) else _of_video if kind == "video" else _of_images
-                found = list(clips(root, info, name))
-                named = ((clip, digests.get(clip.path.relative_to(root).as_posix())) for clip in found)
-                cameras[name] = Camera(feature, [replace(clip, digest=digest) for clip, digest in named])
-                if len(found) != info["total_episodes"]:
-                    raise ValueError(f"{len(found)} episodes, expected {info['total_episodes']}")
-                if gone := sorted({str(clip.path.relative_to(root)) for clip in found if not clip.path.is_file()}):
-                    faults[name] = f"{', '.join(gone[:3])}{' and others' * (len(gone) > 3)} missing"
-            except (CorruptDatasetError, AttributeError, LookupError, TypeError, ValueError) as error:
-                faults[name] = f"its places in meta/episodes cannot be read ({error})"
-    return {name: camera for name, camera in cameras.items() if name not in faults}, faults
+        if not isinstance(feature, Mapping) or (kind := feature.get("dtype")) not in ("video", "image"):
+            continue
+        known, clips, fault, rows = _of_video if kind == "video" else _of_images, dict[int, Clip](), "", 0
+        try:
+            for number, clip in (_of_format_2 if is_format_2(root) else known)(root, info, name):
+                digest = digests.get(clip.path.relative_to(root).as_posix())
+                clips.setdefault(number, replace(clip, digest=digest))
+                rows += 1
+            if [*clips] != [*range(info["total_episodes"])] or rows != len(clips):
+                raise ValueError(f"{rows} episodes, expected {info['total_episodes']}")
+            if gone := sorted({str(clip.path.relative_to(root)) for clip in clips.values() if not clip.path.is_file()}):
+                fault = f"{', '.join(gone[:3])}{' and others' * (len(gone) > 3)} missing"
+        except (CorruptDatasetError, ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+            fault = f"its places in meta/episodes cannot be read ({error})"
+        cameras[name] = Camera(feature, clips, fault)
+    return cameras
 
 
-def _rows(root: Path, names: Sequence[str], camera: str) -> Iterator[tuple[list[Any], dict[str, Any]]]:
-    """Yield the values `names` of each episode, and its statistics of a camera."""
-    stored = {f"stats/{camera}/{key}": key for key in layout.STORED_STATISTICS}
-    for row in (row for block in read_blocks(episodes_files(root), [*names, *stored]) for row in block.to_pylist()):
+def _rows(root: Path, names: Sequence[str], camera: str) -> Iterator[tuple[int, list[Any], dict[str, Any]]]:
+    """Yield the number of each episode, its values `names`, and its statistics of a camera."""
+    stored, number = {f"stats/{camera}/{key}": key for key in layout.STORED_STATISTICS}, "episode_index"
+    for row in (
+        row for block in read_blocks(episodes_files(root), [number, *names, *stored]) for row in block.to_pylist()
+    ):
         known = {key: row[name] for name, key in stored.items() if row.get(name) is not None}
-        yield [row[name] for name in names], known
+        yield row[number], [row[name] for name in names], known
 
 
-def _of_video(root: Path, info: Mapping[str, Any], name: str) -> Iterator[Clip]:
+def _of_video(root: Path, info: Mapping[str, Any], name: str) -> Iterator[tuple[int, Clip]]:
+    pattern, wrong = _video_pattern(info, name), ""
+    known = ["length", *(f"videos/{name}/{key}" for key in layout.VIDEO_PLACE)]
+    for number, (length, chunk, file, from_s, to_s), statistics in _rows(root, known, name):
+        if abs((to_s - from_s) * info["fps"] - length) > 1:
+            wrong = wrong or f"{to_s - from_s:.3f} s for {length} frames"
+            continue
+        path = root / pattern.format(chunk_index=chunk, file_index=file)
+        yield number, Clip(path, name, from_s, 1 / info["fps"], length, None, statistics)
+    if wrong:
+        raise ValueError(wrong)
+
+
+def _video_pattern(info: Mapping[str, Any], name: str) -> str:
     pattern = str(info["video_path"]).replace("{video_key}", name)
     if not is_data_path(pattern):
         raise ValueError(f"expected a video_path inside the folder, got {info['video_path']!r}")
-    known = ["length", *(f"videos/{name}/{key}" for key in layout.VIDEO_PLACE)]
-    for (length, chunk, file, from_s, to_s), statistics in _rows(root, known, name):
-        if abs((to_s - from_s) * info["fps"] - length) > 1:
-            raise ValueError(f"{to_s - from_s:.3f} s for {length} frames")
-        path = root / pattern.format(chunk_index=chunk, file_index=file)
-        yield Clip(path, name, from_s, 1 / info["fps"], length, None, statistics)
+    return pattern
 
 
-def _of_images(root: Path, info: Mapping[str, Any], name: str) -> Iterator[Clip]:
+def _of_images(root: Path, info: Mapping[str, Any], name: str) -> Iterator[tuple[int, Clip]]:
     known = "length", "dataset_from_index", "data/chunk_index", "data/file_index"
     firsts: dict[Path, int] = {}
     if not is_data_path(info["data_path"]):
         raise ValueError(f"expected a data_path inside the folder, got {info['data_path']!r}")
-    for (length, first, chunk, file), statistics in _rows(root, known, name):
+    for number, (length, first, chunk, file), statistics in _rows(root, known, name):
         path = root / info["data_path"].format(chunk_index=chunk, file_index=file)
-        yield Clip(path, name, first - firsts.setdefault(path, first), 1, length, None, statistics)
+        yield number, Clip(path, name, first - firsts.setdefault(path, first), 1, length, None, statistics)
 
 
-def _of_format_2(root: Path, info: Mapping[str, Any], name: str) -> Iterator[Clip]:
+def _of_format_2(root: Path, info: Mapping[str, Any], name: str) -> Iterator[tuple[int, Clip]]:
     for number, place in sorted(read_places(root, info)[0].items()):
         if info["features"][name]["dtype"] == "image" and place.path:
-            yield Clip(place.path, name, 0, 1, place.length)
+            yield number, Clip(place.path, name, 0, 1, place.length)
             continue
         chunk = number // int(info.get("chunks_size", layout.CHUNK_SIZE))
         path = root / f"videos/chunk-{chunk:03d}/{name}/episode_{number:06d}.mp4"
-        yield Clip(path, name, 0, 1 / info["fps"], place.length)
+        yield number, Clip(path, name, 0, 1 / info["fps"], place.length)
+
+
+def clips_of_runs(root: Path, info: Mapping[str, Any], name: str, runs: Iterable[Run]) -> Iterator[tuple[int, Clip]]:
+    """Yield the number and the clip of each episode of `runs`, by its rows.
+
+    Images are in its rows; videos, one after another, have a frame of each row that LeRobot recorded, or tell nothing.
+    """
+    is_video, files, counts = info["features"][name]["dtype"] == "video", list[Path](), list[int]()
+    if is_video:
+        files = sorted(root.glob(re.sub(r"\{[^}]*\}", "*", _video_pattern(info, name))))
+        counts = [len(_index(path, None, path.stat().st_mtime_ns).pts) for path in files]
+        if sum(counts) != info["total_frames"]:
+            return
+    ends = np.cumsum(counts)
+    for run in runs:
+        number, first = int(np.median(run.columns[EPISODE_INDEX])), int(run.columns[INDEX][0])
+        if not is_video:
+            yield number, Clip(run.path, name, run.row, 1, len(run))
+        elif (at := int(np.searchsorted(ends, first, side="right"))) < len(ends) and first + len(run) <= ends[at]:
+            frame = first - int(ends[at]) + counts[at]
+            yield number, Clip(files[at], name, frame / info["fps"], 1 / info["fps"], len(run))
 
 
 def clip_fault(clip: Clip) -> str | None:

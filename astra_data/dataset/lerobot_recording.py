@@ -227,8 +227,10 @@ def open_recording(root: Path) -> dict[str, Any]:
     kept = [episode for episode in episodes if episode.steps]
     if not kept:
         raise BadInputError(f"{root}, recorded by LeRobot, has no episode of two rows or more")
-    cameras, unread = read_cameras(root, info)
-    others = sorted(info["features"].keys() - {*(spec.name for spec in specs), *names.RESERVED, *cameras, *unread})
+    found = read_cameras(root, info)
+    unread = {name: camera.fault for name, camera in found.items() if camera.fault}
+    cameras = {name: camera for name, camera in found.items() if not camera.fault}
+    others = sorted(info["features"].keys() - {*(spec.name for spec in specs), *names.RESERVED, *found})
     _announce(root, rows, columns, episodes, others, unread)
     uids, lengths = [episode.uid for episode in kept], np.array([episode.steps for episode in kept])
     positions = {uid: index for index, uid in enumerate(uids)}
@@ -249,9 +251,10 @@ def open_recording(root: Path) -> dict[str, Any]:
         file_starts=np.zeros(1, dtype=np.int64),
         cameras={
             name: Camera(
-                feature, [clip.part(0, it.steps) for clip, it in zip(clips, episodes, strict=True) if it.steps]
+                camera.feature,
+                dict(enumerate(camera.clips[at].part(0, it.steps) for at, it in enumerate(episodes) if it.steps)),
             )
-            for name, (feature, clips) in cameras.items()
+            for name, camera in cameras.items()
         },
         recorded=RecordedFiles(
             rows=rows,

@@ -227,7 +227,7 @@ class Dataset:
         try:
             blocks = read_values(self, self.specs(list(self.features)), self.selected(None))
             faults = [fault for block, indices in blocks for fault in self.alterations(block, indices)]
-            clips = (clip for camera in self.cameras.values() for clip in camera.clips)
+            clips = (clip for camera in self.cameras.values() for clip in camera.clips.values())
             return faults + [fault for clip in clips if (fault := clip_fault(clip))]
         except CorruptDatasetError as error:
             return [str(error)]
@@ -313,8 +313,8 @@ def _parsed(root: Path, description: dict[str, Any]) -> dict[str, Any]:
     )
     if not plain.is_data_path(info["data_path"]):
         raise BadInputError(f"expected a path inside the dataset's folder, got {info['data_path']!r}")
-    cameras, faults_of = read_cameras(root, info)
-    info["features"] = {name: it for name, it in info["features"].items() if name not in {*cameras, *faults_of}}
+    cameras = read_cameras(root, info)
+    info["features"] = {name: it for name, it in info["features"].items() if name not in cameras}
     columns = [Column.from_feature(name, feature) for name, feature in info["features"].items()]
     tables = pa.concat_tables(read_blocks(plain.episodes_files(root), _LOCATION))
     lengths, chunks, files = (to_numpy(tables.column(name), 1, "int64") for name in _LOCATION)
@@ -326,7 +326,7 @@ def _parsed(root: Path, description: dict[str, Any]) -> dict[str, Any]:
         root / info["data_path"].format(chunk_index=chunk, file_index=file): int(count)
         for (chunk, file), count in zip(places.tolist(), np.bincount(place.ravel(), lengths), strict=True)
     }
-    faults = [f"{name}: {fault}" for name, fault in faults_of.items()]
+    faults = [f"{name}: {camera.fault}" for name, camera in cameras.items() if camera.fault]
     faults += [
         f"{path.relative_to(root)} does not belong to it" for path in sorted({*plain.data_files(root)} - {*rows})
     ]

@@ -55,13 +55,16 @@ def film(path: Path, frames: int, codec: str = "libx264", **options: str) -> Pat
 @pytest.fixture(scope="module")
 def source(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     """Three episodes with two cameras, a file each; the first frame of what they were made from belongs to none."""
+    return recorded(tmp_path_factory.mktemp("cameras"), first=1)
+
+
+def recorded(folder: Path, first: int, **options: str) -> Dataset:
     patch = pytest.MonkeyPatch()
     patch.setattr("astra_data.dataset.parquet.FILE_SIZE_LIMIT", 100)
     patch.setattr("astra_data.dataset.format.VIDEO_FILE_SIZE_MB", 0)
-    folder, total = tmp_path_factory.mktemp("cameras"), sum(LENGTHS.values()) + 1
+    total = first + sum(LENGTHS.values())
     stills = (np.full((4, 4, 3), number, np.uint8) for number in range(total))
-    video, images = film(folder / "video.mp4", total), write_images(folder / "images.parquet", TOP, stills)
-    first = 1
+    video, images = film(folder / "video.mp4", total, **options), write_images(folder / "images.parquet", TOP, stills)
     with writer(folder / "set", cameras=FEATURES) as opened:
         for uid, steps in LENGTHS.items():
             statistics = STATISTICS | {"count": [steps]}
@@ -208,6 +211,30 @@ def test_a_recording_whose_camera_cannot_be_found_opens_without_it(
     found = Dataset.open(root)
     assert list(found.cameras) == ([] if fault == "expected 3" else [TOP]) and len(found) == len(LENGTHS)
     assert re.search(f"{FRONT} is left out: .*{fault}", caplog.text)
+
+
+@pytest.mark.parametrize("known", [0, 1, 2])
+def test_repair_finds_pictures_that_metadata_lack_by_their_rows(tmp_path: Path, known: int) -> None:
+    """A recorder that is killed has written some rows of meta/episodes, or none."""
+    source = recorded(tmp_path, first=0, g="1")
+    root = shutil.copytree(source.root, tmp_path / "killed", ignore=shutil.ignore_patterns("astra"))
+    [path] = (root / "meta/episodes").rglob("*.parquet")
+    pq.write_table(pq.read_table(path)[:known], path)
+    notes = repair(root, out=tmp_path / "repaired").notes
+    assert any(f"{FRONT}: its places in meta/episodes cannot be read ({known} episodes" in note for note in notes)
+    assert_shows(tmp_path / "repaired", source, {uid: (uid, slice(-1)) for uid in LENGTHS})  # without next states
+    # Images are in the files that have no footer yet, which are read for their numbers alone.
+    for data in (root / "data").rglob("*.parquet"):
+        data.write_bytes(data.read_bytes()[:-8])
+    repair(root, out=tmp_path / "numbers")
+    assert list((numbers := Dataset.open(tmp_path / "numbers")).cameras) == [FRONT]
+    np.testing.assert_array_equal(numbers.pictures(FRONT, 2), source.pictures(FRONT, 2)[:-1])
+    # Where a video is gone, whose rows the others' frames are of is not known.
+    min((root / "videos").rglob("*.mp4")).unlink()
+    notes = repair(root, out=tmp_path / "again").notes
+    assert list((again := Dataset.open(tmp_path / "again")).cameras) == ([FRONT] if known == 2 else [])
+    assert again.uids.tolist() == ([8] if known == 2 else [*LENGTHS])
+    assert ("left out the episode of uid 5: its pictures of" in "".join(notes)) == (known == 2)
 
 
 def test_a_version_may_be_without_cameras(source: Dataset, tmp_path: Path) -> None:

@@ -97,11 +97,11 @@ def check(root: Path) -> Report:
             EpisodeChecks(root, info, columns, digests, report).run()
         except AstraDataError as error:
             report.fault("values", str(error))
-    cameras, unread = read_cameras(root, info)
-    for name, fault in unread.items():
-        report.fault("cameras", f"{name}: {fault}")
-    for name, camera in cameras.items():
-        for number, clip in enumerate(camera.clips):
+    for name, camera in read_cameras(root, info).items():
+        if camera.fault:
+            report.fault("cameras", f"{name}: {camera.fault}")
+            continue
+        for number, clip in camera.clips.items():
             if fault := clip_fault(clip):
                 report.fault("cameras", f"{name} in episode {number}: {fault}")
     if is_ours and not report.faults:

@@ -1,7 +1,8 @@
 """Save the intact episodes of a damaged LeRobot dataset, ours or another tool's, into a new one."""
 
 import hashlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -13,7 +14,7 @@ from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.dataset import columns as names
 from astra_data.dataset import format as layout
 from astra_data.dataset import lerobot_recording as lerobot
-from astra_data.dataset.cameras import Camera, clip_fault, read_cameras
+from astra_data.dataset.cameras import Camera, clip_fault, clips_of_runs, read_cameras
 from astra_data.dataset.columns import Array, Column, Episode, Scalar, distinct_uids, renamed_metadata
 from astra_data.dataset.description import Digests, altered_files, read_description, read_digests
 from astra_data.dataset.doctor.salvage import whole_runs
@@ -75,7 +76,8 @@ def repair(
     recorded: list[lerobot.Found] = []
     theirs = {uid for source in sources for uid in source.uids.tolist()}
     task = " / ".join(str(tasks[index]) for index in sorted(tasks)) or "unknown"
-    description, seed, cameras = _description(folder, remains, sources), remains.subset_seed, remains.cameras
+    description, seed = _description(folder, remains, sources), remains.subset_seed
+    cameras = _seen(folder, remains, whole, notes)
     features = {name: camera.feature for name, camera in cameras.items()}
     known_facts: dict[str, Any] = {"task": task, "description": description, "subset_seed": seed}
     with DatasetWriter(out, remains.specs, fps=remains.fps, cameras=features, **known_facts) as writer:
@@ -99,8 +101,9 @@ def repair(
             try:
                 values, at = remains.values(run, uid), int(np.median(run.columns[names.EPISODE_INDEX]))
                 steps = len(next(iter(values.values())))
-                clips = {name: camera.clips[at].part(0, steps) for name, camera in cameras.items()}
-                if unseen := [fault for clip in clips.values() if (fault := clip_fault(clip))]:
+                clips = {name: of[at].part(0, steps) for name, (_, of, _) in cameras.items() if at in of}
+                unseen = [f"its pictures of {name} are not known" for name in cameras if name not in clips]
+                if unseen := unseen + [fault for clip in clips.values() if (fault := clip_fault(clip))]:
                     raise BadInputError("; ".join(unseen))
                 episode = Episode(known.uid, values, known.metadata, clips)
                 writer.add(episode)
@@ -212,13 +215,8 @@ def remains_of(folder: Path, sources: Sequence[Dataset], notes: list[str]) -> Re
         specs = lerobot.our_columns(specs, has_tasks=not isinstance(tasks, str) and len(tasks) > 1)
     if is_format_2(folder):
         notes.append(f"LeRobot's format {info['codebase_version']} became {layout.CODEBASE_VERSION}")
-    cameras, unread = read_cameras(folder, info)
-    for name, fault in unread.items():
-        notes.append(f"{name} is left out: {fault}")
-    for name in [name for name, camera in cameras.items() if all(map(clip_fault, camera.clips))]:
-        unread[name] = str(clip_fault(cameras.pop(name).clips[0]))
-        notes.append(f"{name} is left out: {unread[name]}")
-    if others := sorted(info["features"].keys() - {*rows.stored, *cameras, *unread}):
+    cameras = read_cameras(folder, info)
+    if others := sorted(info["features"].keys() - {*rows.stored, *cameras}):
         notes.append(f"left out, because they are not numeric: {', '.join(others)}")
     kinds = {spec.name: spec.dtype for spec in specs}
     for column in columns:
@@ -257,6 +255,25 @@ def remains_of(folder: Path, sources: Sequence[Dataset], notes: list[str]) -> Re
             fault = subsets if isinstance(subsets, str) else "has no whole number as its seed"
             notes.append(f"{layout.SUBSETS_PATH} {fault}: {_IF_ALTERED[layout.SUBSETS_PATH]}")
     return remains
+
+
+def _seen(
+    folder: Path, remains: Remains, whole: Callable[[list[str]], Iterable[tuple[int, Run]]], notes: list[str]
+) -> dict[str, Camera]:
+    """Return the cameras of which pictures are left, of LeRobot's also those that it tells no places of."""
+    cameras = {}
+    for name, (feature, told, fault) in remains.cameras.items():
+        clips = dict(told)
+        if fault and not (folder / layout.OUR_FOLDER).is_dir():
+            with suppress(CorruptDatasetError, LookupError, TypeError, ValueError):
+                clips = dict(clips_of_runs(folder, remains.info, name, (run for _, run in whole([])))) | clips
+        unseen = [clip_fault(clip) for clip in clips.values()]
+        if all(unseen):
+            notes.append(f"{name} is left out: {fault or unseen[0]}")
+            continue
+        notes += [f"{name}: {fault}"] if fault else []
+        cameras[name] = Camera(feature, clips)
+    return cameras
 
 
 def _metadata(folder: Path, notes: list[str]) -> dict[int, dict[str, Scalar]]:

@@ -2,9 +2,9 @@
 
 import io
 import mmap
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import accumulate, chain, groupby
+from itertools import chain, groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,6 +25,7 @@ _FIELDS = {0: (5, 2), _DICTIONARY: (7, 2), _DATA_V2: (8, 4)}
 _FIXED_WIDTH = (0, 9)  # encodings PLAIN and BYTE_STREAM_SPLIT
 _HEADER = 1000  # upper bound of a page header in bytes, including the extremes of its values
 _SNAPPY, _ZSTD, _ZSTD_MAGIC = 1, 6, b"\x28\xb5\x2f\xfd"
+_IMAGE = pa.struct({"bytes": pa.binary(), "path": pa.string()})
 TRUE, FALSE, BYTE, I16, I32, I64 = range(1, 7)
 BINARY, LIST, STRUCT = 8, 9, 12
 Struct = dict[int, tuple[int, Any]]
@@ -54,9 +55,14 @@ def whole_runs(
     notes += [f"{name} is missing" for name in plain.missing_files(folder, places)]
     counted = info.get("total_episodes")
     most = len(next(iter(digests.values()))) if digests else counted if isinstance(counted, int) else 2**31
+    features = listed if isinstance(listed := info.get("features"), Mapping) else {}
+    stored = {column.name: column.arrow_type for column in columns}
+    pictured = (name for name, of in features.items() if isinstance(of, Mapping) and of.get("dtype") == "image")
+    stored = dict.fromkeys(pictured, _IMAGE) | stored
+    schema = pa.schema([(name, stored[name]) for name in dict.fromkeys([*features, *stored]) if name in stored])
     episode = row = 0
     uids: set[int] = set()
-    for run, is_cut in _every_run(folder, columns, notes):
+    for run, is_cut in _every_run(folder, columns, schema, notes):
         rows = f"rows {run.row} to {run.row + len(run) - 1} of {_name(run.path)}"
         # As most rows tell: the episode, its first row in the dataset and its first frame.
         steps, found = np.arange(len(run)), run.columns
@@ -107,54 +113,73 @@ def _name(path: Path) -> str:
     return "/".join(path.parts[-3:])
 
 
-def _every_run(root: Path, columns: Sequence[plain.PlainColumn], notes: list[str]) -> Iterator[tuple[plain.Run, bool]]:
+def _every_run(
+    root: Path, columns: Sequence[plain.PlainColumn], schema: pa.Schema, notes: list[str]
+) -> Iterator[tuple[plain.Run, bool]]:
     """Yield each run, and whether the rows after it cannot be read."""
     for path in plain.data_files(root):
         try:
-            yield from _runs_of(path, columns, notes)
+            yield from _runs_of(path, columns, schema, notes)
         except (*UNREADABLE, CorruptDatasetError) as error:
             notes.append(f"{_name(path)} cannot be read: {in_short(error)}")
 
 
-def _runs_of(path: Path, columns: Sequence[plain.PlainColumn], notes: list[str]) -> Iterator[tuple[plain.Run, bool]]:
+def _runs_of(
+    path: Path, columns: Sequence[plain.PlainColumn], schema: pa.Schema, notes: list[str]
+) -> Iterator[tuple[plain.Run, bool]]:
     """Yield the runs of a file, and whether the rows after each cannot be read."""
     is_whole = not isinstance(plain.read_footer(path), str)
-    schema = pa.schema([(column.name, column.arrow_type) for column in columns])
     held: plain.Run | None = None
     with pq.ParquetFile(path, metadata=None if is_whole else rebuilt_metadata(path, schema)) as file:
-        counts = [file.metadata.row_group(group).num_rows for group in range(file.num_row_groups)]
-        starts = [0, *accumulate(counts)]
+        last = file.metadata.row_group(file.num_row_groups - 1).num_rows if file.num_row_groups else 0
         if not is_whole:
-            notes.append(f"{_name(path)} has no footer: {len(counts)} whole row groups were found in it")
-        for is_read, stretch in groupby(_row_groups(file, columns), lambda one: isinstance(one[1], pa.Table)):
+            notes.append(f"{_name(path)} has no footer: {file.num_row_groups} whole row groups were found in it")
+        for is_read, stretch in groupby(_stretches(file, columns), lambda one: isinstance(one[2], pa.Table)):
             if is_read:
-                group, table = next(stretch)
-                for run in plain.runs(path, chain([table], (one for _, one in stretch)), columns):
+                first, _, table = next(stretch)
+                for run in plain.runs(path, chain([table], (one for _, _, one in stretch)), columns):
                     if held is not None:
                         yield held, False
-                    held = replace(run, row=starts[group] + run.row)
+                    held = replace(run, row=first + run.row)
                 continue
             if held is not None:
                 yield held, True
-            held = None
-            for group, fault in stretch:
-                rows = f"rows {starts[group]} to {starts[group + 1] - 1}"
-                notes.append(f"{_name(path)} {rows} cannot be read ({fault})")
+            held, lost = None, list(stretch)
+            rows = f"rows {lost[0][0]} to {lost[-1][1] - 1}"
+            notes.append(f"{_name(path)} {rows} cannot be read ({lost[0][2]})")
     # LeRobot writes a row group per episode. With others, the last episode may be incomplete.
     if held is not None:
-        yield held, not is_whole and len(held) != counts[-1]
+        yield held, not is_whole and len(held) != last
 
 
-def _row_groups(file: pq.ParquetFile, columns: Sequence[plain.PlainColumn]) -> Iterator[tuple[int, pa.Table | str]]:
-    """Yield the number of each row group, and its table or what is wrong with it."""
+def _stretches(file: pq.ParquetFile, columns: Sequence[plain.PlainColumn]) -> Iterator[tuple[int, int, pa.Table | str]]:
+    """Yield first row, end and table of stretches of a file, or what is wrong with them."""
+    first = 0
     for group in range(file.num_row_groups):
+        end = first + file.metadata.row_group(group).num_rows
         try:
             table = file.read_row_group(group, columns=[column.name for column in columns], use_threads=False)
-            if not plain.schema_faults(table.schema, columns):
-                plain.block_values(table, columns)
-            yield group, table
+            yield from _readable(first, table, columns)
         except (*UNREADABLE, CorruptDatasetError) as error:
-            yield group, in_short(error)
+            yield first, end, in_short(error)
+        first = end
+
+
+def _readable(
+    first: int, table: pa.Table, columns: Sequence[plain.PlainColumn]
+) -> Iterator[tuple[int, int, pa.Table | str]]:
+    """Yield a table, from the row `first` on, or its halves where a value of it cannot be read."""
+    try:
+        if not plain.schema_faults(table.schema, columns):
+            plain.block_values(table, columns)
+    except CorruptDatasetError as error:
+        if (half := len(table) // 2) == 0:
+            yield first, first + 1, in_short(error)
+            return
+        yield from _readable(first, table[:half], columns)
+        yield from _readable(first + half, table[half:], columns)
+    else:
+        yield first, first + len(table), table
 
 
 class _Page(NamedTuple):
@@ -172,14 +197,17 @@ class _Page(NamedTuple):
 def _may_hold(page: _Page, bits: int) -> bool:
     """Return whether `page` may be of values of so many bits: does its size match?"""
     least = page.values * bits // 8
-    is_fixed = page.kind != _DICTIONARY and page.encoding in _FIXED_WIDTH
+    is_fixed = bits and page.kind != _DICTIONARY and page.encoding in _FIXED_WIDTH
     return not is_fixed or least <= page.unpacked <= least + page.values // 2 + _HEADER
 
 
 def rebuilt_metadata(path: Path, schema: pa.Schema) -> pq.FileMetaData:
     """Return the metadata of all whole row groups of the parquet file at `path`, for `ParquetFile(metadata=...)`."""
-    leaves: list[tuple[int, int]] = []  # values per row, and bits per value
+    leaves: list[tuple[int, int]] = []  # values per row, and bits per value, 0 where these differ
     for field in schema:
+        if field.type == _IMAGE:
+            leaves += [(1, 0)] * _IMAGE.num_fields
+            continue
         is_list = pa.types.is_fixed_size_list(field.type)
         value = field.type.value_type if is_list else field.type
         if not pa.types.is_primitive(value):

@@ -51,10 +51,10 @@ def test_what_is_intact_is_read(root: Path, damage: Callable[[Path], object], le
     assert uids == [UIDS[index] for index in left] and len(notes) == 1 and note in notes[0]
 
 
-def test_a_number_that_is_missing_costs_its_row_group(root: Path) -> None:
+def test_a_number_that_is_missing_costs_its_episode(root: Path) -> None:
     alter(DATA, "action", 9, None)(root)
     uids, notes = salvaged(root)
-    assert uids == UIDS[-2:] and "rows 0 to 9 cannot be read (action: expected 2 values" in notes[0]
+    assert uids == UIDS[:2] + UIDS[-2:] and "rows 9 to 9 cannot be read (action: expected 2 values" in notes[1]
 
 
 @pytest.mark.parametrize(
