@@ -39,6 +39,8 @@ def write_minari(folder: Path, made: list[dict[str, Any]], data_format: str = "h
     """Write a dataset below `folder`, and return its own folder."""
     is_dict = isinstance(made[0]["observations"], dict)
     parts = {"observation": box(3), "achieved_goal": box(2), "desired_goal": box(2)}
+    if is_dict and "camera" in made[0]["observations"]:
+        parts["camera"] = spaces.Box(0, 255, (4, 4, 3), np.uint8)
     with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings(action="ignore"):
         patch.setenv("MINARI_DATASETS_PATH", str(folder))
         # It warns that there is no environment, no description and the like.

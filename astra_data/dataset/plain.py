@@ -21,7 +21,7 @@ from astra_data.dataset.parquet import UNREADABLE, open_parquet, read_blocks, to
 TIMESTAMP_TOLERANCE_S = 1e-4  # as LeRobot's own; what float32 cannot tell apart is allowed beside it
 EPISODES_AT_ONCE = 100  # rows of meta/episodes held in memory
 MOST_FPS = 2**31  # upper bound of steps per second
-_NUMBERS = ("bool", "float16", "float32", "float64", *(f"{u}int{bits}" for u in ("", "u") for bits in (8, 16, 32, 64)))
+NUMBERS = ("bool", "float16", "float32", "float64", *(f"{u}int{bits}" for u in ("", "u") for bits in (8, 16, 32, 64)))
 _END_FLAGS = (names.TERMINATED, names.TRUNCATED, names.DONE)
 _DATA_PATH = re.compile(r"([\w./ -]|\{(chunk|file)_index(:0?\d{1,2}d)?\})+")
 _LOCATION = ("episode_index", "length", "dataset_from_index", "data/chunk_index", "data/file_index")
@@ -79,7 +79,7 @@ def plain_columns(features: Mapping[str, Any]) -> tuple[list[PlainColumn], list[
     for name, feature in features.items():
         shape, dtype = (feature.get(key) if isinstance(feature, Mapping) else None for key in ("shape", "dtype"))
         size = shape[0] if isinstance(shape, Sequence) and len(shape) == 1 else None
-        if dtype in _NUMBERS and type(size) is int and 0 < size <= names.MOST_VALUES:
+        if dtype in NUMBERS and type(size) is int and 0 < size <= names.MOST_VALUES:
             columns.append(PlainColumn(name, dtype, size))
         else:
             others.append(name)
@@ -303,6 +303,9 @@ def run_faults(run: Run, *, number: int, row: int, fps: float) -> Iterator[tuple
             where = f"episode {number} frame {at[0]}" + (f" index {at[1]}" if len(at) > 1 else "")
             wanted = f", expected {expected[name][at]}" if name in expected else ", expected a finite number"
             more = f" ({int(wrong.sum())} values are wrong)" if wrong.sum() > 1 else ""
+            steps = np.diff(values) if name == names.TIMESTAMP and len(values) > 1 else np.full(1, np.nan)
+            if np.abs(steps - steps.mean()).max() < 0.01 * steps.mean() < np.abs(steps.mean() - 1 / fps):
+                more += f": they are {1 / steps.mean():.4g} a second, the fps of {layout.INFO_PATH} is {fps:g}"
             yield name, f"{name} is {values[at]} in {where}{wanted}{more}"
 
 

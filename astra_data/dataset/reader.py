@@ -289,8 +289,10 @@ class Dataset:
         if isinstance(names, str):
             raise BadInputError(f"expected a list of columns, got the text '{names}': write ['{names}']")
         names = [*names]  # which may come one by one
-        if unknown := ", ".join(f"{name}" for name in names if name not in self.features):
-            raise BadInputError(f"{self.reference} has no column {unknown}; it has {', '.join(self.features)}.")
+        if unknown := [f"{name}" for name in names if name not in self.features]:
+            seen = " (of a camera's pictures `astra-data features` makes one)" if {*unknown} & {*self.cameras} else ""
+            has = f"it has {', '.join(self.features)}."
+            raise BadInputError(f"{self.reference} has no column {', '.join(unknown)}{seen}; {has}")
         return [Column.from_feature(name, self.features[name]) for name in names]
 
 

@@ -17,7 +17,9 @@ FAR = 5.0  # how far beyond the recorded range a state may be, in widths of it: 
 class RobotPolicy:
     """The policy, for one robot: `start` an episode, then `act` once every control period."""
 
-    def __init__(self, *, rate_hz: float, state: Sequence[str], goal: Sequence[str] = (), folder: Path = HERE) -> None:
+    def __init__(
+        self, *, rate_hz: float, state: Sequence[str], goal: Sequence[str] = (), folder: str | Path = HERE
+    ) -> None:
         """Take the rate at which it will act, and the names of the values that it will be given."""
         described, graph = intact(folder, "policy.json", "policy.onnx")
         self.about: dict[str, Any] = json.loads(described)
@@ -49,8 +51,9 @@ class RobotPolicy:
         return command[0]
 
 
-def intact(folder: Path, *names: str) -> list[bytes]:
+def intact(folder: str | Path, *names: str) -> list[bytes]:
     """Return what the files hold, or raise a ValueError if manifest.json has other digests of them."""
+    folder = Path(folder)
     try:
         files = json.loads((folder / "manifest.json").read_bytes())["files"]
         expected = [str(files[name]["sha256"]) for name in names]
@@ -84,11 +87,14 @@ def refuse_far(state: Any, about: dict[str, Any]) -> None:  # noqa: ANN401 - an 
 def finite(called: str, given: Any, names: Sequence[str]) -> Any:  # noqa: ANN401 - anything like an array
     """Return what was `given` as an array of float32, or raise a ValueError if it is not one value a name."""
     try:
-        values = np.asarray(given, np.float32)
+        with np.errstate(over="ignore"):
+            values = np.asarray(given, np.float32)
     except (TypeError, ValueError):  # texts, rows of several lengths
         values = np.full(len(names), np.nan)
     if values.shape != (len(names),) or not np.isfinite(values).all():
-        raise ValueError(f"{called}: expected {len(names)} finite values {names}, got {given!r}")
+        shape = "" if values.ndim == 1 else f" of the shape {values.shape}"
+        shown = " ".join(f"{given!r}".split())
+        raise ValueError(f"{called}: expected {len(names)} finite values {names}, got {shown}{shape}")
     return values
 
 

@@ -32,6 +32,8 @@ def export(dataset: Dataset, out: Path, *, format: str) -> None:
         raise BadInputError(f"{dataset.reference} cannot be exported: it lacks {', '.join(missing)}")
     if REWARD not in dataset.features:
         _log.warning("%s has no %s: rewards are written as 0", dataset.reference, REWARD)
+    if dataset.cameras:
+        _log.warning("%s: %s left out, pictures are not exported", dataset.reference, ", ".join(dataset.cameras))
     refuse_existing(out)
     with hidden_folder(out) as folder:
         path = folder if format == "minari" else folder / out.name

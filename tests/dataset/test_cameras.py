@@ -227,12 +227,14 @@ def test_repair_finds_pictures_that_metadata_lack_by_their_rows(tmp_path: Path, 
     for data in (root / "data").rglob("*.parquet"):
         data.write_bytes(data.read_bytes()[:-8])
     repair(root, out=tmp_path / "numbers")
-    assert list((numbers := Dataset.open(tmp_path / "numbers")).cameras) == [FRONT]
+    numbers = Dataset.open(tmp_path / "numbers")
+    assert list(numbers.cameras) == [FRONT]
     np.testing.assert_array_equal(numbers.pictures(FRONT, 2), source.pictures(FRONT, 2)[:-1])
     # Where a video is gone, whose rows the others' frames are of is not known.
     min((root / "videos").rglob("*.mp4")).unlink()
     notes = repair(root, out=tmp_path / "again").notes
-    assert list((again := Dataset.open(tmp_path / "again")).cameras) == ([FRONT] if known == 2 else [])
+    again = Dataset.open(tmp_path / "again")
+    assert list(again.cameras) == ([FRONT] if known == 2 else [])
     assert again.uids.tolist() == ([8] if known == 2 else [*LENGTHS])
     assert ("left out the episode of uid 5: its pictures of" in "".join(notes)) == (known == 2)
 
@@ -247,6 +249,8 @@ def test_cameras_are_shown_and_shared_with_their_dataset(source: Dataset) -> Non
     assert inspect_dataset(source).cameras == {FRONT: [64, 64, 3], TOP: [4, 4, 3]}
     assert f"| `{FRONT}` | video | (64, 64, 3) |" in render_card(source, Notes())
     assert "videos/observation.images.front/chunk-000/file-000.mp4" in dataset_files(source.root)
+    with pytest.raises(BadInputError, match=r"has no column .*\.front \(of a camera's pictures `astra-data features`"):
+        source.columns([FRONT])
 
 
 def test_pictures_load_as_frames(source: Dataset) -> None:

@@ -114,7 +114,14 @@ def test_wrong_values_of_a_run_are_found(name: str, at: int | tuple[int, int], v
     values = a_run().columns[name].copy()
     values[at] = value
     [(column, fault)] = plain.run_faults(a_run(**{name: values}), number=3, row=20, fps=10)
-    assert column == name and sentence in fault
+    assert column == name and sentence in fault and "a second" not in fault
+
+
+@pytest.mark.parametrize(("offset", "step", "told"), [(0.0, 0.05, "they are 20 a second"), (5.0, 0.1, "")])
+def test_timestamps_of_another_rate_name_it(offset: float, step: float, told: str) -> None:
+    values = (offset + step * np.arange(4)).astype(np.float32)
+    [(_, fault)] = plain.run_faults(a_run(**{TIMESTAMP: values}), number=3, row=20, fps=10)
+    assert fault.partition("wrong)")[2] == (told and f": {told}, the fps of meta/info.json is 10")
 
 
 @pytest.mark.parametrize(

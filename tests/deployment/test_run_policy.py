@@ -67,7 +67,7 @@ def test_without_its_manifest_no_policy_is_made(content: str, folder: Path, tmp_
     ],
 )
 def test_a_state_far_outside_what_was_recorded_is_refused(state: list[float], refused: str, folder: Path) -> None:
-    policy = RobotPolicy(**GIVEN, folder=folder)
+    policy = RobotPolicy(**GIVEN, folder=str(folder))
     if not refused:
         assert policy.act(state, [1.0]).shape == (1,)
         return
@@ -106,7 +106,8 @@ def test_another_rate_and_other_values_are_refused(wrong: dict[str, Any], told: 
     ("state", "goal", "told"),
     [
         ([0.0, np.nan], [1.0], r"state: expected 2 finite values \['x', 'speed'\], got \[0.0, nan\]"),
-        ([[0.0, 0.0]], [1.0], "state: expected 2 finite values"),
+        (np.zeros((5, 2)), [1.0], r"got array\(\[\[0., 0.\], \[0., 0.\],.* of the shape \(5, 2\)$"),
+        ([0.0, 1e300], [1.0], r"state: expected 2 finite values .*, got \[0.0, 1e\+300\]$"),
         ([0.0, "fast"], [1.0], r"state: expected 2 finite values .*, got \[0.0, 'fast'\]"),
         ([0.0, 0.0], [np.inf], r"goal: expected 1 finite values \['goal_0'\], got \[inf\]"),
         ([0.0, 0.0], [], "goal: expected 1 finite values"),

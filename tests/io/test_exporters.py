@@ -1,6 +1,7 @@
 import gc
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -9,6 +10,7 @@ import pytest
 from fake_dataset import COLUMNS, LENGTHS, NEXT, fake_columns, write_fake, write_transitions, writer
 
 from astra_data.core.errors import BadInputError
+from astra_data.dataset.cameras import Camera
 from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED, Column, Episode
 from astra_data.dataset.reader import Dataset
 from astra_data.io.exporters import EXPORTERS, export, hdf5_file
@@ -50,6 +52,15 @@ VECTORS_OF = {
         f"data/demo_1/{field}" for field in ("obs/state", "next_obs/state", "obs/goal", "next_obs/goal", "actions")
     ),
 }
+
+
+def test_cameras_are_named_as_left_out(
+    dataset: Dataset, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(EXPORTERS, "d4rl", lambda _, path, __: path.touch())
+    filmed = replace(dataset, cameras={"observation.images.top": Camera({}, {})})
+    export(filmed, tmp_path / "out.hdf5", format="d4rl")
+    assert caplog.messages[-1].endswith(": observation.images.top left out, pictures are not exported")
 
 
 @pytest.mark.parametrize("format", sorted(EXPORTERS))

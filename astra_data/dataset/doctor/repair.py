@@ -262,8 +262,8 @@ def _seen(
 ) -> dict[str, Camera]:
     """Return the cameras of which pictures are left, of LeRobot's also those that it tells no places of."""
     cameras = {}
-    for name, (feature, told, fault) in remains.cameras.items():
-        clips = dict(told)
+    for name, (feature, known, fault) in remains.cameras.items():
+        clips = dict(known)
         if fault and not (folder / layout.OUR_FOLDER).is_dir():
             with suppress(CorruptDatasetError, LookupError, TypeError, ValueError):
                 clips = dict(clips_of_runs(folder, remains.info, name, (run for _, run in whole([])))) | clips

@@ -36,9 +36,12 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
 
 
 def layout(source: Source) -> dict[str, Any]:
-    """Return the keys of a mapping: the state is every part of the observation but the desired goal."""
+    """Return the keys of a mapping: the state is every part of the observation but the desired goal and pictures."""
     fields = _fields(next(iter(_open(source).iterate_episodes([0]))))
-    state = [f for f in fields if f.split("/")[0] == "observations" and f != GOAL_FIELD]
+    pictures = {name for name, values in fields.items() if values.ndim > 2 and values.dtype == np.uint8}
+    state = [f for f in fields if f.split("/")[0] == "observations" and f not in {GOAL_FIELD, *pictures}]
+    if not state:
+        raise BadInputError(f"{source}: expected observations that are no pictures, got {', '.join(sorted(pictures))}")
     columns = {
         STATE: {"fields": state},
         NEXT_STATE: {"fields": [f"next_{field}" for field in state]},

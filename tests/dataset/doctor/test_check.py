@@ -81,6 +81,8 @@ def test_a_copy_without_its_description_is_not_whole(root: Path) -> None:
         (edit("meta/info.json", fps="20"), ["fps is '20', expected a positive number"]),
         (edit("meta/info.json", fps=2**31), ["expected a positive number below 2^31"]),
         (declare("action", names=["x"]), ["action: 1 names for 2 values"]),
+        (declare("action", shape=["2"]), ["action has the shape ['2'], expected whole numbers"]),
+        (declare("action", shape=2), ["action has the shape 2, expected whole numbers"]),
     ],
 )
 def test_damage_is_found(root: Path, damage: Callable[[Path], object], parts: list[str]) -> None:
@@ -190,7 +192,7 @@ def plain(root: Path) -> Path:
 
 def test_what_is_no_number_is_no_column_of_a_plain_dataset(plain: Path) -> None:
     declare("next.reward", dtype=None)(plain)
-    declare("action", shape=["2"])(plain)
+    declare("action", shape=[2, 1])(plain)
     report = check(plain)
     assert report.faults == [] and "not checked, because they are not numeric: action, next.reward" in report.notes
 

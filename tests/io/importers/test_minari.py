@@ -14,9 +14,12 @@ from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, REWARD, STATE, 
 @pytest.mark.parametrize("data_format", ["hdf5", "arrow"])
 def test_every_value_of_a_goal_dataset_arrives(tmp_path: Path, data_format: str) -> None:
     made = episodes(is_dict=True)
+    for episode in made:
+        episode["observations"]["camera"] = np.zeros((len(episode["rewards"]) + 1, 4, 4, 3), np.uint8)
     path = write_minari(tmp_path / "minari", made, data_format=data_format)
     dataset, report = imported(tmp_path, path, None, name="ant", fps=10)
     assert dataset.lengths.tolist() == list(LENGTHS) and report.tally.split_points == {"source": 1}
+    assert "fields left out: observations/camera" in str(report)
     for got, episode in zip(dataset.episodes(), made, strict=True):
         parts = episode["observations"]
         state = np.concatenate([parts["achieved_goal"], parts["observation"]], axis=1).astype(np.float32)
