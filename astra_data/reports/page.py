@@ -25,7 +25,7 @@ WORDS = {
     "nas": "NAS: neural-augmented simulation, a correction of the simulator's next state alone",
     "iql": "IQL: implicit Q-learning, from the recorded steps alone",
     "rma": "RMA: rapid motor adaptation",
-    "compass": "COMPASS: simulator parameters fitted to the episodes",
+    "compass": "COMPASS: simulator parameters drawn uniformly from the wide ranges that the paper prints",
 }  # what the names of methods stand for
 
 
