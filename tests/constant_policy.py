@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from astra_data.policies.running_policy import Array
+from astra_data.dataset.columns import Array
 
 
 class Constant:

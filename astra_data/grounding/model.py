@@ -106,6 +106,17 @@ class GroundingModel(nn.Module):
         slope = (predicted * recorded).sum() / power if power > 0 else torch.zeros_like(power)
         self.reward_shrinkage.copy_(slope.clamp(0.0, 1.0))
 
+    def check(self, episodes: PairedEpisodes) -> None:
+        """Refuse episodes whose states, goals or actions are of other sizes than those that it was fitted to."""
+        shape = self.shape
+        fitted = {"state": shape.state_size, "goal": shape.goal_size, "action": shape.action_size}
+        found = {name: getattr(episodes.windows, name).shape[-1] for name in fitted}
+        if found != fitted:
+            raise BadInputError(
+                f"the grounding was fitted to values {fitted}, {episodes.reference} has {found}: run the stage "
+                "`ground` with this dataset"
+            )
+
     def state_features(self, state: Tensor) -> Tensor:
         """Normalize abstract states (..., X) and append features of the robot's and the ball's position."""
         position, index = state[..., :2], self.shape.ball_index

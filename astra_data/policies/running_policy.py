@@ -24,9 +24,6 @@ if TYPE_CHECKING:
     from astra_data.grounding.alignment import TargetEncoder
     from astra_data.policies.networks import Policy
 
-Array = NDArray[Any]
-
-
 Given = Tensor | NDArray[np.float32] | NDArray[np.float64]  # what measures and goals come in
 Shown = Mapping[str, Given | NDArray[np.uint8]]  # in place of states: columns, or pictures, by their names
 

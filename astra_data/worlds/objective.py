@@ -8,7 +8,6 @@ import numpy as np
 
 from astra_data.core.arrays import Floats
 from astra_data.core.lazy import Tensor, torch
-from astra_data.worlds.plane.mazes import Maze
 
 
 @dataclass(frozen=True)
@@ -42,6 +41,7 @@ class Objective(ABC):
         ends_at_walls: whether touching a wall is a failure, which ends an episode.
         is_lasting: whether success is to last to the horizon, not to reach something before.
         action_size: A. goal_size: G, 0 where all episodes have the same goal.
+        maze: that it happens in, where there is one.
 
     Example:
         >>> import numpy as np
@@ -59,11 +59,6 @@ class Objective(ABC):
     success_reward: float = field(default=10.0, kw_only=True)
     failure_reward: float = field(default=-10.0, kw_only=True)
     ends_at_walls: bool = field(default=False, kw_only=True)
-
-    @property
-    def layout(self) -> Maze | None:
-        """The maze that it happens in; None by default."""
-        return None
 
     @property
     def scores(self) -> tuple[Score, ...]:

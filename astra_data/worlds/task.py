@@ -387,7 +387,8 @@ class Task:
     @property
     def plane(self) -> Maze | None:
         """The maze; None where there is none."""
-        return self.objective.layout
+        maze: Maze | None = getattr(self.objective, "maze", None)
+        return maze
 
     @property
     def maze(self) -> Maze:

@@ -105,7 +105,7 @@ def told(episodes: PairedEpisodes, *, by_latent: bool) -> Tensor:
     """Return what is seen of steps: noise, but for one entry that is larger in the last two of failures."""
     torch.manual_seed(7)
     shape = untrained(episodes).shape
-    walls = 1 + 2 * 5 if TASK.objective.layout else 0
+    walls = 1 + 2 * 5 if TASK.plane else 0
     seen = torch.randn(*episodes.windows.mask.shape, shape.input_size + walls + 8)
     last = failing(TASK, episodes).windows.fails_soon
     seen[..., -1 if by_latent else 0] += 4.0 * last

@@ -105,11 +105,10 @@ def test_only_the_ant_has_legs_of_several_lengths(task: Task) -> None:
 
 SIMULATION = Simulation(WorldConfig())
 SPEED = 4.0
-FORWARD = PolicyFile(UserPolicy(Constant(1.0), 2, 1), SIMULATION, None, None)
 
 
 def test_the_goals_are_those_of_the_seed_in_any_simulator() -> None:
-    acting = running(CART, FORWARD, NO_GROUNDING)
+    acting = running(CART, constant(1.0), NO_GROUNDING)
     begin = partial(started, acting, acting.act_in_simulator)
     asked = RecordedRange(torch.tensor([0.0]), torch.tensor([2.0]), CART.limits)
     runs = [

@@ -11,13 +11,14 @@ from toy_episodes import no_episodes
 
 from astra_data.core.durable import file_digest
 from astra_data.core.errors import BadInputError
+from astra_data.dataset.columns import Array
 from astra_data.grounding.alignment import TargetEncoder
 from astra_data.grounding.files import save_grounding
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.model import GroundingModel, GroundingShape
 from astra_data.policies.learner import KINDS
 from astra_data.policies.networks import ActorCritic, AdaptiveShape, PolicyShape, Student, UserPolicy
-from astra_data.policies.running_policy import Array, PolicyFile, RunningPolicy, Shown
+from astra_data.policies.running_policy import PolicyFile, RunningPolicy, Shown
 from astra_data.policies.simulator_env import Simulation, WorldConfig, policy_observation
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.variation import PlanarVariation

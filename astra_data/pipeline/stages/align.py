@@ -77,6 +77,7 @@ def align(
     grounding_file = grounding / GROUNDING
     model = load_history_model(grounding_file, device)
     episodes = PairedEpisodes.load(dataset, device, config.inputs)
+    model.check(episodes)
     training, held_out = episodes.split(config.held_out_share, seed)
     torch.manual_seed(derive(seed, "alignment"))
     shape = model.shape

@@ -67,6 +67,8 @@ def train(
     grounding_file = grounding and grounding / GROUNDING
     initial_file = initial and initial / POLICY
     correction = grounding_at(grounding_file, device)
+    if check := getattr(correction.encoder, "check", None):
+        check(episodes)
     beginning = PolicyFile.load(initial_file, device) if initial_file else None
     if beginning and beginning.simulation and beginning.simulation.world.command_limit != NO_LIMIT:
         fault = "was trained with command_limit, which has no effect on"

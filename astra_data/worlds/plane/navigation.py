@@ -24,11 +24,6 @@ class PlanarObjective(Objective):
 
     maze: Maze
 
-    @property
-    def layout(self) -> Maze:
-        """The maze that it happens in."""
-        return self.maze
-
     @abstractmethod
     def draw_anywhere(self, rng: np.random.Generator, count: int) -> Floats:
         """Draw states (count, X), at rest, anywhere in the free space; where there is a ball, near it."""
@@ -156,8 +151,7 @@ class PlanarTarget(ABC):
 
     def _start(self, rows: NDArray[np.intp]) -> Floats:
         """Return the abstract states (n, X) at which the robots `rows` (n,) start."""
-        objective = self.objective
-        draw = objective.draw_anywhere if self.start_anywhere else objective.draw_starts
+        draw = self.objective.draw_anywhere if self.start_anywhere else self.objective.draw_starts
         return draw(self._rng, len(rows))
 
     def _aim(self, rows: NDArray[np.intp]) -> None:

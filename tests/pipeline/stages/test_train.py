@@ -6,14 +6,19 @@ from typing import Any
 import pytest
 from small_run import TRAIN
 from stopping import Stopped, stop_past
+from toy_episodes import no_episodes
 
 from astra_data.core.artifact import read_manifest
 from astra_data.core.durable import file_digest
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, silent
+from astra_data.grounding.files import GROUNDING, save_grounding
+from astra_data.grounding.history import HistoryGrounding
+from astra_data.grounding.model import GroundingModel, GroundingShape
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.methods import METHODS
 from astra_data.methods.rma import RmaConfig
+from astra_data.pipeline.stages.align import align
 from astra_data.pipeline.stages.ground import ground
 from astra_data.pipeline.stages.train import train
 from astra_data.policies.networks import ActorCritic, PolicyShape, SoftActor, Student
@@ -152,6 +157,12 @@ def test_methods_that_do_not_fit_are_refused(task: str, paired: Path, tmp_path: 
     with pytest.raises(BadInputError, match=r"grounding.safetensors does not exist") as caught:
         make(task, "astra", paired, tmp_path, tmp_path / "out")
     assert "\n" not in str(caught.value)
+    other = HistoryGrounding(GroundingModel(GroundingShape(5, 2, 2, latent_size=8)))
+    save_grounding(tmp_path / GROUNDING, other, no_episodes())
+    with pytest.raises(BadInputError, match=r"fitted to values \{'state': 5.* has \{'state': 4.*: run the stage `gr"):
+        make(task, "nas", paired, tmp_path, tmp_path / "out")
+    with pytest.raises(BadInputError, match=r"fitted to values \{'state': 5"):
+        align(dataset=paired, grounding=tmp_path, out=tmp_path / "out")
 
 
 def test_data_without_goals_are_refused_where_policies_meet_them(

@@ -31,10 +31,6 @@ from astra_data.worlds.variation import JointVariation, VariedSimulator
 NOTHING = torch.zeros(3, 0)
 
 
-def made(kind: type[tasks.Walking]) -> tasks.Walking:
-    return kind(horizon=5)
-
-
 @pytest.mark.parametrize(
     ("kind", "bias", "scatter", "early"), [(tasks.PlanarWalking, 0.1, 0.8, 0.0), (tasks.MassWalking, 0.03, 0.05, 4.0)]
 )
@@ -48,7 +44,7 @@ def test_pay_and_falls_are_the_targets_but_for_costs(
     env = humanoid.HumanoidEnv(humanoid.Locomotion(effort_cost=0.0, contact_cost=0.0), 32, seed=0, num_threads=1)
     env.reset()
     generator = torch.Generator().manual_seed(0)
-    objective, alive = made(kind), torch.ones(32, dtype=torch.bool)
+    objective, alive = kind(horizon=5), torch.ones(32, dtype=torch.bool)
     wrong, astray, misjudged = [], [], []
     for number in range(80):
         if number % 7 == 0:
@@ -76,7 +72,7 @@ def test_the_walkers_mass_moves_as_mujoco_says() -> None:
     heights = torch.tensor([[1.0], [1.01], [1.99], [2.0]])
     assert objective.missed(heights, NOTHING).tolist() == [True, False, False, True]
     masses = torch.tensor([[0.0] * 36 + [mass_m] + [0.0] * 9 for mass_m in (0.64, 0.65)])
-    assert made(tasks.MassWalking).missed(masses, NOTHING).tolist() == [True, False]
+    assert tasks.MassWalking(horizon=5).missed(masses, NOTHING).tolist() == [True, False]
     data = mujoco.MjData(model)
     generator = np.random.default_rng(0)
     data.qpos[1:], data.qvel[:] = [1.4, 0.3, -0.4, -1.0, 0.2, -0.5], generator.normal(size=7)
