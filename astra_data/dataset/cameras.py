@@ -9,6 +9,7 @@ with it, unless that is longer than `MOST_EXTRA_S`; then its frames are encoded 
 import io
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property, lru_cache
@@ -19,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from astra_data.core.durable import file_digest
-from astra_data.core.errors import BadInputError, CorruptDatasetError
+from astra_data.core.errors import BadInputError, CorruptDatasetError, in_short
 from astra_data.dataset import format as layout
 from astra_data.dataset.columns import EPISODE_INDEX, INDEX, Clip
 from astra_data.dataset.parquet import read_blocks
@@ -225,23 +226,24 @@ def clip_fault(clip: Clip) -> str | None:
     try:
         if clip.path.suffix == ".mp4":
             _indexed(clip).frames(clip)
-        elif any(not one["bytes"] for one in images(clip)):
-            return f"{clip.path} has no picture in a row of {clip.camera}"
+        else:
+            images(clip)
     except CorruptDatasetError as error:
         return str(error)
     return None
 
 
 def images(clip: Clip) -> list[dict[str, Any]]:
-    """Return the stored images of a clip in a parquet file, its bytes and path each."""
+    """Return the stored images of a clip in a parquet file, its bytes, of which there are some, and path each."""
     rows, footer = np.rint(clip.start + np.arange(clip.count) * clip.step).astype(int), read_footer(clip.path)
     if isinstance(footer, str) or footer[0] <= rows[-1] or clip.camera not in footer[1].names:
         fault = footer if isinstance(footer, str) else f"has no images of {clip.camera} up to row {rows[-1]}"
         raise CorruptDatasetError(f"{clip.path} {fault}")
     wanted = np.zeros(footer[0], bool)
     wanted[rows] = True
-    found = [one for block in read_blocks([clip.path], [clip.camera], wanted) for one in block[0].to_pylist()]
-    if len(found) != clip.count or not all(isinstance(one, dict) for one in found):
+    stored = (one for block in read_blocks([clip.path], [clip.camera], wanted) for one in block[0].to_pylist())
+    found = [one for one in stored if isinstance(one, dict) and one.get("bytes")]
+    if len(found) != clip.count:
         raise CorruptDatasetError(f"{clip.path} has {len(found)} images of {clip.camera}, expected {clip.count}")
     return found
 
@@ -259,7 +261,20 @@ def pictures_of(clip: Clip) -> Iterator[NDArray[Any]]:
         return
     from PIL import Image  # noqa: PLC0415 - slow
 
-    yield from (np.asarray(Image.open(io.BytesIO(one["bytes"]))) for one in images(clip))
+    for one in images(clip):
+        with _decoding(clip):
+            picture = np.asarray(Image.open(io.BytesIO(one["bytes"])))
+        yield picture
+
+
+@contextmanager
+def _decoding(clip: Clip) -> Iterator[None]:
+    """Turn any exception of the library that decodes a clip into a CorruptDatasetError."""
+    try:
+        yield
+    except Exception as error:
+        fault = f"a picture of {clip.camera} cannot be decoded ({in_short(error)})"
+        raise CorruptDatasetError(f"{clip.path}: {fault}") from error
 
 
 def _decode(clip: Clip) -> Iterator[Any]:
@@ -267,7 +282,7 @@ def _decode(clip: Clip) -> Iterator[Any]:
 
     wanted = _indexed(clip).frames(clip)
     left = set(wanted.tolist())
-    with av.open(str(clip.path)) as container:
+    with _decoding(clip), av.open(str(clip.path)) as container:
         stream = container.streams.video[0]
         container.seek(int(wanted[0]), stream=stream)
         for frame in container.decode(stream):
@@ -314,10 +329,8 @@ class ClipWriter:
             for packet in container.demux(source):
                 if packet.pts is None or packet.pts < begin:
                     continue
-                packet.pts, packet.dts = (
-                    packet.pts + offset,
-                    (packet.pts if packet.dts is None else packet.dts) + offset,
-                )
+                packet.dts = (packet.pts if packet.dts is None else packet.dts) + offset
+                packet.pts += offset
                 packet.stream = self._stream
                 self._mux(packet)
                 left -= 1
@@ -337,12 +350,12 @@ class ClipWriter:
             self._stream = self._output.add_stream(_ENCODERS[index.codec], rate=self._fps, options=_OPTIONS)
             self._stream.width, self._stream.height, self._stream.pix_fmt = index.shape
         from_s, number = self._time_s, round(self._time_s * self._fps)
+        self._time_s = from_s + clip.count / self._fps
         for count, frame in enumerate(_decode(clip)):
             frame.pts, frame.time_base = number + count, Fraction(1, self._fps)
             frame.pict_type = 1 if count == 0 else 0  # each clip begins with a key frame
             for packet in self._stream.encode(frame):
                 self._mux(packet)
-        self._time_s = from_s + clip.count / self._fps
         return Span(self._file, from_s, self._time_s)
 
     def _mux(self, packet: Any) -> None:  # noqa: ANN401 - of PyAV

@@ -93,9 +93,7 @@ def rows_of(chosen: Ints, starts: Ints, lengths: Ints, total: int) -> Bools | No
     return wanted
 
 
-def read_arrays(
-    paths: Sequence[Path], columns: Sequence[Column], wanted: Bools | None = None
-) -> Iterator[dict[str, Array]]:
+def read_arrays(paths: Sequence[Path], columns: Sequence[Column], wanted: Bools | None) -> Iterator[dict[str, Array]]:
     """Yield the blocks of `read_blocks` as contiguous arrays by name, (n,) or (n, size)."""
     most_rows = min(BLOCK_ROWS, max(1, BLOCK_VALUES // sum(column.size for column in columns)))
     for table in read_blocks(paths, [column.name for column in columns], wanted, most_rows):
@@ -105,18 +103,11 @@ def read_arrays(
 class RotatingWriter:
     """Writes tables as row groups, and starts the next file once one has reached `FILE_SIZE_LIMIT`."""
 
-    def __init__(
-        self,
-        root: Path,
-        pattern: str,
-        schema: pa.Schema,
-        encodings: Mapping[str, str] | None = None,
-        compression: str = "snappy",  # as LeRobot's; zstd is smaller, and slower
-    ) -> None:
-        """Start the first file; `pattern` names the files, `encodings` those of their columns."""
+    def __init__(self, root: Path, pattern: str, schema: pa.Schema, encodings: Mapping[str, str], packing: str) -> None:
+        """Start the first file; `pattern` names the files, `encodings` those of their columns, `packing` of pages."""
         self._number = 0  # of the file
         self._root, self._pattern, self._schema = root, pattern, schema
-        self._encodings, self._compression = encodings, compression
+        self._encodings, self._packing = encodings, packing
         self._open()
 
     def _open(self) -> None:
@@ -127,8 +118,8 @@ class RotatingWriter:
         self._writer = pq.ParquetWriter(
             self._file,
             self._schema,
-            compression=self._compression,
-            use_dictionary=self._encodings is None,
+            compression=self._packing,
+            use_dictionary=False,
             column_encoding=self._encodings,
         )
 

@@ -24,7 +24,8 @@ from astra_data.dataset.versions import Change, next_version
 _log = logging.getLogger(__name__)
 
 _COMPARED = {"<=": le, ">=": ge, "==": eq, "!=": ne, "<": lt, ">": gt}
-_CONDITION = re.compile(r"\s*(.+?)\s*(<=|>=|==|!=|<|>)\s*(\S+)\s*")
+_NUMBER = r"true|false|[+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?"
+_CONDITION = re.compile(rf"\s*(.+?)\s*(<=|>=|==|!=|<|>)\s*({_NUMBER})\s*", re.IGNORECASE | re.ASCII)
 _OBSERVED = re.compile(r"(next\.)?observation\.")
 _FINEST = 100  # times the recorded rate
 type _Turns = dict[int, float]  # full turns of the angles in a column, by their index
@@ -122,22 +123,16 @@ def _write(
 
 def _condition(source: Dataset, text: str) -> Callable[[Episode], Bools]:
     """Return a function that says in which steps of an episode "NAME < NUMBER" holds."""
-    parts = _CONDITION.fullmatch(text)
+    if not (parts := _CONDITION.fullmatch(text)):
+        raise BadInputError(f"expected a condition such as 'v < 0.05' or 'next.success == true', got {text!r}")
+    value, compared, number = parts.groups()
+    limit = float({"true": 1, "false": 0}.get(number.lower(), number))
     known = {
         label: (column, index)
         for column in reversed(source.schema)  # of names that several have, the first
         for index, value in enumerate(column.labels)
         for label in ([column.name] if column.size == 1 else [value, f"{column.name}.{value}"])
     }
-    try:
-        value, compared, number = parts.groups() if parts else ("", "", "")
-        limit = {"true": 1.0, "false": 0.0}.get(number.lower()) if number.isalpha() else float(number)
-        if limit is None:
-            raise ValueError
-    except ValueError:
-        raise BadInputError(
-            f"expected a condition such as 'v < 0.05' or 'next.success == true', got {text!r}"
-        ) from None
     if value not in known:
         raise BadInputError(f"{source.reference} has no value {value!r}{did_you_mean(value, known)}")
     column, index = known[value]
@@ -229,15 +224,14 @@ def _interpolated(values: Floats, at: Floats, column: Column, turns: _Turns) -> 
     high = np.minimum(low + 1, len(values) - 1)
     share = np.clip(at - low, 0.0, 1.0)[:, None]
     share[share < 1e-6] = 0.0
-    first, second = values[low], values[high].copy()
-    for role, part in column.roles:
-        if role == "quaternion":
-            second[:, part] *= np.where((first[:, part] * second[:, part]).sum(axis=1, keepdims=True) < 0, -1.0, 1.0)
+    first, second = values[low], values[high]
     found = (1 - share) * first + share * second
     for role, part in column.roles:
         if role == "quaternion":
-            norm = np.linalg.norm(found[:, part], axis=1, keepdims=True)
-            found[:, part] /= np.where(norm > 0.0, norm, 1.0)
+            sign = np.where((first[:, part] * second[:, part]).sum(axis=1, keepdims=True) < 0, -1.0, 1.0)
+            turned = (1 - share) * first[:, part] + sign * share * second[:, part]
+            norm = np.linalg.norm(turned, axis=1, keepdims=True)
+            found[:, part] = turned / np.where(norm > 0.0, norm, 1.0)
     found = np.where(share == 0.0, first, found)
     for index, turn in turns.items():
         if (values[:, index] != recorded[:, index]).any():  # wrapped angles stay so

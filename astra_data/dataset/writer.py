@@ -119,7 +119,8 @@ class DatasetWriter:
         with ExitStack() as stack:
             self._folder = stack.enter_context(durable.atomic_folder(self.root))
             encodings = layout.data_encodings(self._stored)
-            self._data = parquet.RotatingWriter(self._folder, layout.DATA_PATH, self._schema, encodings)
+            # As LeRobot's; zstd is smaller, and slower.
+            self._data = parquet.RotatingWriter(self._folder, layout.DATA_PATH, self._schema, encodings, "snappy")
             stack.callback(self._data.abandon)
             self._rows = EpisodeRows(self._folder, self._stored, self._task, self._cameras)
             self._clips = {
@@ -164,7 +165,6 @@ class DatasetWriter:
                     raise CorruptDatasetError(f"{error}: {advice}") from None
                 place = (*divmod(span.file, layout.CHUNK_SIZE), span.from_s, span.to_s)
                 pictures |= {f"videos/{name}/{key}": x for key, x in zip(layout.VIDEO_PLACE, place, strict=True)}
-        self._admission.keep(episode)
         values = {name: episode.columns[name] for name in self._columns} | layout.reserved_values(
             length, uid=episode.uid, episode=len(self._lengths), start=self._frames, fps=self._fps
         )
@@ -174,6 +174,7 @@ class DatasetWriter:
             for name, clip in episode.cameras.items()
             if name in self._schema.names
         }
+        self._admission.keep(episode)
         if self._group_rows + length > self._most_rows:
             self._write_group()
         chunk, file = self._data.locate()

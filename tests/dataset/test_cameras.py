@@ -190,6 +190,21 @@ def test_without_its_videos_a_camera_is_left_out_and_the_rest_recovered(source: 
     assert list(whole.cameras) == [TOP] and len(whole) == len(LENGTHS)
 
 
+def test_a_picture_that_cannot_be_decoded_is_told(tmp_path: Path) -> None:
+    table = pq.read_table(write_images(tmp_path / "images.parquet", TOP, [np.zeros((4, 4, 3), np.uint8)] * 4))
+    rows = table[TOP].to_pylist()
+    rows[1]["bytes"], rows[3]["bytes"] = b"no picture", None
+    pq.write_table(pa.table({TOP: pa.array(rows, table.schema[0].type)}), tmp_path / "damaged.parquet")
+    video = film(tmp_path / "film.mp4", 20)
+    content = video.read_bytes()
+    begin, end = content.index(b"mdat") + 1000, content.index(b"moov") - 4
+    video.write_bytes(content[:begin] + bytes(end - begin) + content[end:])
+    for clip in (Clip(tmp_path / "damaged.parquet", TOP, 0, 1, 2), Clip(video, FRONT, 0.0, 1 / FPS, 20)):
+        with pytest.raises(CorruptDatasetError, match=f"{clip.path}: a picture of {clip.camera} cannot be decoded"):
+            decoded(clip)
+    assert "has 1 images of" in str(clip_fault(Clip(tmp_path / "damaged.parquet", TOP, 2, 1, 2)))
+
+
 @pytest.mark.parametrize("fault", ["missing", "expected 3", "1.950 s for 14 frames", "inside the folder"])
 def test_a_recording_whose_camera_cannot_be_found_opens_without_it(
     source: Dataset, tmp_path: Path, caplog: pytest.LogCaptureFixture, fault: str

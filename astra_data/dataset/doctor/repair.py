@@ -107,7 +107,7 @@ def repair(
                     raise BadInputError("; ".join(unseen))
                 episode = Episode(known.uid, values, known.metadata, clips)
                 writer.add(episode)
-            except BadInputError as error:
+            except (BadInputError, CorruptDatasetError) as error:
                 notes.append(f"left out the episode of uid {uid}: {error}")
                 continue
             unknown += not known.is_known
