@@ -42,17 +42,11 @@ def deletion(called: str, uids: Sequence[int]) -> str:
     return f"astra-data filter {called} {options}" + (" ..." if len(uids) > SHOWN else "")
 
 
-def labels(column: Column) -> list[str]:
-    """Return a name for each value of `column`."""
-    return [column.name] if column.size == 1 and not column.names else list(column.labels)
-
-
 def channels(column: Column, indices: Sequence[int]) -> str:
     """Name the values `indices` of `column`: "x, y of observation.state"."""
     if column.size == 1:
         return column.name
-    names = labels(column)
-    return f"{', '.join(names[index] for index in indices)} of {column.name}"
+    return f"{', '.join(column.labels[index] for index in indices)} of {column.name}"
 
 
 def is_angle(name: str) -> bool:
@@ -299,7 +293,7 @@ def commands(column: Column, episodes: Iterable[Array], extremes: Floats, fps: i
 
     `extremes` (2, A) are the smallest and the largest of all; a choice among few commands has no edge.
     """
-    names, held, steps = labels(column), Counter[int](), 0
+    names, held, steps = column.names or ([column.name] if column.size == 1 else column.labels), Counter[int](), 0
     at_edge, known = np.zeros(column.size, np.int64), list[Array]([np.zeros(0)] * column.size)
     for actions in episodes:
         held.update(held_steps(actions).tolist())

@@ -9,13 +9,7 @@ import pyarrow as pa
 
 from astra_data.core.arrays import Floats, as_rows
 from astra_data.dataset.columns import Array, Column
-from astra_data.dataset.format import (
-    EPISODES_PATH,
-    QUANTILES,
-    STATISTICS,
-    STORED_STATISTICS,
-    episodes_schema,
-)
+from astra_data.dataset.format import EPISODES_PATH, QUANTILES, STATISTICS, STORED_STATISTICS, episodes_schema
 from astra_data.dataset.parquet import RotatingWriter, to_arrow
 from astra_data.dataset.plain import PlainColumn
 

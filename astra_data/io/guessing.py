@@ -318,11 +318,8 @@ def _roles(fields: Sequence[Field]) -> list[Field]:
 def _places(fields: Sequence[Field], episodes: Sequence[dict[str, Floats]]) -> list[Field]:
     """Return the fields, with latitude and longitude in m, and with offsets where float32 loses steps."""
     gps = {field.name: found for field in fields if (found := GPS.fullmatch(field.short))}
-    latitudes = {  # of the first episode that has any
-        found["stem"]: known[0]
-        for name, found in gps.items()
-        if found["axis"] == "lat" and (known := [one[name] for one in episodes if np.isfinite(one[name]).any()])
-    }
+    known = {name: [one[name] for one in episodes if np.isfinite(one[name]).any()] for name in gps}
+    latitudes = {found["stem"]: known[name][0] for name, found in gps.items() if found["axis"] == "lat" and known[name]}
     pairs = {found["stem"] for found in gps.values() if found["axis"] != "lat"} & latitudes.keys()
     offsets: dict[str, float] = {}
     placed = {field.name: field for field in fields}

@@ -1,17 +1,13 @@
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from damaged import edit, reseal, truncate
-from fake_dataset import LENGTHS, concatenated
 
 from astra_data.core.errors import CorruptDatasetError
-from astra_data.dataset import Dataset, parquet
-from astra_data.dataset.columns import STATE
+from astra_data.dataset import Dataset
 from astra_data.dataset.format import DATASET_PATH
-from astra_data.dataset.reader import read_values
 
 
 def drop_rows(root: Path) -> None:
@@ -52,21 +48,3 @@ def test_damage_is_told_in_one_line(root: Path, damage: Callable[[Path], object]
     assert message.endswith(repair) and "\n" not in message
     for part in parts:
         assert part in message
-
-
-@pytest.mark.parametrize("block_rows", [1, 20, 2**16])
-@pytest.mark.parametrize(("group_rows", "chosen"), [(4, [0, 1, 2, 3, 4]), (13, [1, 3]), (1000, [4])])
-def test_blocks_are_whole_episodes_whatever_the_row_groups(
-    dataset: Dataset, monkeypatch: pytest.MonkeyPatch, block_rows: int, group_rows: int, chosen: list[int]
-) -> None:
-    monkeypatch.setattr(parquet, "BLOCK_ROWS", block_rows)
-    [path] = dataset.paths
-    pq.write_table(pq.read_table(path), path, row_group_size=group_rows)
-    found, values = [], []
-    for block, episodes in read_values(dataset, dataset.specs([STATE, "mode"]), np.array(chosen)):
-        assert len(block[STATE]) == len(block["mode"]) == sum(LENGTHS[episode] for episode in episodes)
-        found += episodes.tolist()
-        values.append(block[STATE])
-    assert found == chosen
-    rows = [row for e in chosen for row in range(dataset.starts[e], dataset.starts[e] + LENGTHS[e])]
-    np.testing.assert_array_equal(np.concatenate(values), concatenated(STATE)[rows])
