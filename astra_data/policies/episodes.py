@@ -214,7 +214,6 @@ class TargetEpisodes(NamedTuple):
     """Episodes in the target."""
 
     outcome: Outcome
-    filmed: Tensor  # the states (T + 1, S) of the first
     start_goal: dict[str, Tensor]  # where they began, "start" (B, 2) or with balls (B, 4), and "goal" (B, G)
 
 
@@ -240,23 +239,19 @@ def in_target(
     start_goal = {"start": env.position.clone(), "goal": env.goal.clone()}
     act = begin(env.goal)
     record = EpisodeRecord(env.position)
-    filmed = [env.state[0]]
     began = time.perf_counter()
     for step in range(task.objective.horizon):
-        is_filmed = bool(record.active[0])
         action = act(env.state, env.goal)
         if asked is not None:
             asked.count(action, record.active)
         outcome = env.step(action, record.active)
         success = task.objective.succeeded(outcome.success, env.failed, step + 1)
         record.add(env.position, outcome.reward, success, env.failed, env.wall_contact)
-        if is_filmed:
-            filmed.append(env.state[0])
         rate = record.total_steps / (time.perf_counter() - began)
         progress((step + 1) / task.objective.horizon * 0.99, f"{rate:,.0f} target steps/s")
         if not record.active.any():
             break
-    return TargetEpisodes(record.outcome(), torch.stack(filmed), start_goal)
+    return TargetEpisodes(record.outcome(), start_goal)
 
 
 def judged_success(task: Task, judge: Grounding, policy: RunningPolicy, episodes: int, seed: int) -> float:

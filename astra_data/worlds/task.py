@@ -266,7 +266,6 @@ class Task:
         simulator_id: names the abstract simulator in datasets, by default after its class.
         varied: the same simulator with parameters that vary, by default what reaches it of the commands.
         wall_reach_m: a robot whose clearance in the maze is larger than this touches no wall.
-        photograph: renders target states (K, S) as pictures (K, height, width, 3).
         target_id: name of a target that several tasks share, so that episodes of one serve all.
         derived: the defaults that were filled in, by field: `dataclasses.replace` fills them in anew.
 
@@ -298,7 +297,6 @@ class Task:
     simulator_id: str = ""
     varied: Varied = Varied(VariedCommands, RANDOMIZED_COMMANDS, RANDOMIZED_COMMANDS)
     wall_reach_m: float = 0.0
-    photograph: Callable[[Floats], NDArray[np.uint8]] | None = None
     target_id: str | None = None
     derived: Mapping[str, Any] = field(default_factory=dict, repr=False, compare=False)
 

@@ -85,7 +85,6 @@ def driving(speed: float) -> Act:
 def test_episodes_end_in_success_in_failure_or_with_their_time() -> None:
     there = in_target(CART, lambda goal: driving(0.9), 5, seed=3)
     assert there.outcome.success == [1.0] * 5 and there.outcome.failed == [0.0] * 5
-    assert len(there.filmed) - 1 == there.outcome.steps[0] < max(there.outcome.steps)
     tipped = in_target(CART, lambda goal: driving(3.5), 5, seed=3)
     assert tipped.outcome.failed == [1.0] * 5 and tipped.outcome.steps == [1] * 5
     late = in_target(CART, lambda goal: driving(-0.5), 5, seed=3)
@@ -93,7 +92,6 @@ def test_episodes_end_in_success_in_failure_or_with_their_time() -> None:
     other = in_target(CART, lambda goal: driving(3.5), 5, seed=4)
     assert torch.equal(late.start_goal["goal"], tipped.start_goal["goal"])
     assert not torch.equal(other.start_goal["goal"], tipped.start_goal["goal"])
-    assert late.filmed.shape == (CART.objective.horizon + 1, 2) and tipped.filmed.shape == (2, 2)
 
 
 @pytest.mark.parametrize("task", [CART, TASKS["nao-navigation"], TASKS["humanoid-walker2d"]])

@@ -6,7 +6,6 @@ from html_pages import read_page
 
 from astra_data.core.naming import in_code
 from astra_data.reports import blocks
-from astra_data.reports.figures.catalog import FIGURES
 
 PNG = b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR" + (400).to_bytes(4) + (200).to_bytes(4)
 
@@ -67,8 +66,7 @@ def test_sections_are_linked_and_figures_drawn_on_white_are_dark_where_the_page_
     assert page.attributes("img") == [{"src": source, "alt": "A figure", "width": "200"}]
     dark = re.findall(r"prefers-color-scheme: dark\) \{(.*?)\n\}", text, flags=re.DOTALL)
     (rule,) = (line for block in dark for line in block.splitlines() if "img" in line)
-    (photo,) = re.findall(r'img:not\(\[alt\^="(.*)"\]\) \{ filter: invert\(', rule)
-    assert [name for name, figure in FIGURES.items() if figure.title.startswith(photo)] == ["strips"]
+    assert "img { filter: invert(" in rule
     site = (Path(__file__).parents[2] / "docs/site.css").read_text()
     assert re.search(r'data-md-color-scheme="slate"\] .*img \{ filter: invert\(', site)
 

@@ -99,10 +99,8 @@ class TargetRobot(gymnasium.Env[dict[str, Any], Array]):
         return self._observe(), float(step.reward[0]), bool(step.terminated[0]), is_over, info
 
     def render(self) -> Array:
-        """Return a picture (height, width, 3) of the state; a blank one, if the task has no `photograph`."""
-        if self._task.photograph is None:
-            return np.full((64, 64, 3), 255, np.uint8)
-        return np.asarray(self._task.photograph(self._env.state.double().numpy())[0])
+        """Return a blank picture (height, width, 3), as LeRobot films what it evaluates."""
+        return np.full((64, 64, 3), 255, np.uint8)
 
     def _observe(self) -> dict[str, Array]:
         shown = {STATE: self._env.state, GOAL: self._env.goal}

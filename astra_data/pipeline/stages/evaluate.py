@@ -131,8 +131,6 @@ def evaluate(
         headline = tested[row.headline]
         results["target"] = headline.outcome.to_json()
         tensors = {"target.position": headline.outcome.position} | headline.start_goal
-        if world.photograph is not None:
-            tensors["target.state"] = headline.filmed
     else:
         results |= {"tested_in": tested_in, "encoder": "source"}
     for name, simulator in simulators.items():

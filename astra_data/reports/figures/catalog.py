@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from astra_data.reports.blocks import Picture
 from astra_data.reports.figures import charts
-from astra_data.reports.figures.motion import mismatch, strips, trajectories
+from astra_data.reports.figures.motion import mismatch, trajectories
 from astra_data.reports.figures.style import Scene, png
 from astra_data.reports.results import Results
 
@@ -41,13 +41,6 @@ FIGURES = {
         "failed episode ends with a cross, a successful one at its goal (a star if drawn). Starts and goals are "
         "drawn separately in the two worlds, so lines are not pairs: compare their routes and where they end. "
         "The number is the success rate {where} over all episodes and seeds.",
-        "methods",
-    ),
-    "strips": Drawing(
-        strips,
-        "The first episode of each method",
-        "The target at the times above the pictures, in the first evaluation episode of the first seed; all "
-        "methods have the same start. A strip ends with its episode.",
         "methods",
     ),
     "gap": Drawing(

@@ -1,4 +1,4 @@
-"""Where policies go: trajectories in the maze, pictures, and identical commands in simulator and target."""
+"""Where policies go: trajectories in the maze, and identical commands in simulator and target."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,10 +12,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
 from astra_data.core.arrays import Floats
-from astra_data.core.errors import BadInputError
 from astra_data.methods import method_title
 from astra_data.reports.artifacts import EVALUATION, TRAJECTORIES, Evaluation, read_json, read_tensors
-from astra_data.reports.figures.style import DEPLOYED, FAINT, INK, SIMULATED, WALL, Scene, method_color, style
+from astra_data.reports.figures.style import DEPLOYED, FAINT, INK, SIMULATED, WALL, Scene, style
 from astra_data.reports.results import Results
 from astra_data.worlds.plane.mazes import Maze
 from astra_data.worlds.task import Task
@@ -56,8 +55,6 @@ def replay_commands(task: Task) -> tuple[Floats, Floats, Floats, Floats]:
 
 COLUMNS, PANEL_INCHES = 4, 2.0  # panels side by side, at most, and the width of one
 TITLE_POINTS, TITLE_LETTERS = 10.0, 17  # font size of a panel's title; one of more letters is smaller
-TIMES_S = (0.0, 0.5, 1.0, 1.5, 2.0, 4.0, 8.0)  # of the pictures of an episode, in addition to the time limit
-PICTURE_INCHES = 0.95  # width of such a picture
 RIM = 0.35  # visible width of the outer walls, in cells
 
 
@@ -115,43 +112,6 @@ def _walked(folder: Path, episodes: int) -> tuple[list[tuple[Floats, list[float]
     if evaluation.simulated and "simulated.position" in tensors:
         found.append((tensors["simulated.position"][:episodes], evaluation.simulated.success, SIMULATED, "--"))
     return found, tensors["goal"][:episodes]
-
-
-@style()
-def strips(results: Results, scene: Scene) -> Figure | None:
-    """Draw the first episode of each method in pictures at the same times; None if nothing can render."""
-    task, folders = scene.task, scene.folders(results)
-    if task.photograph is None or not folders:
-        return None
-    longest_s = task.objective.horizon * task.timestep_s
-    times_s = [time_s for time_s in TIMES_S if time_s < longest_s] + [longest_s]
-    found = {}
-    for row, folder in folders.items():
-        states = read_tensors(folder / TRAJECTORIES, ("target.state",))["target.state"]
-        moments = [round(time_s / task.timestep_s) for time_s in times_s]
-        try:
-            pictures = task.photograph(states[[moment for moment in moments if moment < len(states)]])
-        except BadInputError:
-            return None
-        failed = bool(read_json(Evaluation, folder / EVALUATION).outcomes.failed[0])
-        ended_s = (len(states) - 1) * task.timestep_s
-        found[row] = (pictures, f"fell after {ended_s:.1f} s" if failed else f"{ended_s:.0f} s")
-    height, width = next(iter(found.values()))[0].shape[1:3]
-    size = (1.7 + PICTURE_INCHES * len(times_s), 0.3 + PICTURE_INCHES * height / width * len(found))
-    figure = Figure(figsize=size, layout="constrained")
-    grid = figure.subplots(len(found), len(times_s), squeeze=False)
-    for line, (row, (pictures, ended)) in zip(grid, found.items(), strict=True):
-        for axes in line:
-            axes.set_axis_off()
-        for axes, picture in zip(line, pictures, strict=False):
-            axes.imshow(picture)
-        place = {"transform": line[0].transAxes, "ha": "right"}
-        name = method_title(row).replace(" + ", " +\n").replace(", ", ",\n")
-        line[0].text(-0.08, 0.55, name, va="bottom", weight="bold", color=method_color(row), **place)
-        line[0].text(-0.08, 0.5, ended, va="top", color=FAINT, size=8, **place)
-    for axes, time_s in zip(grid[0], times_s, strict=True):
-        axes.set_title(f"{time_s:g} s", size=8, weight="normal")
-    return figure
 
 
 def mismatch(_: Results, scene: Scene) -> Figure | None:

@@ -1,6 +1,5 @@
 """The humanoid's tasks: walking of Gymnasium's humanoid, with three abstract simulators (Section V-B)."""
 
-import os
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from copy import copy
@@ -10,10 +9,8 @@ from importlib.resources import files
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from astra_data.core.arrays import Floats, normalized
-from astra_data.core.errors import BadInputError
 from astra_data.core.lazy import Tensor, mujoco, torch
 from astra_data.dataset.columns import ABSTRACT_STATE, ACTION, STATE
 from astra_data.robots.humanoid import target as humanoid
@@ -328,30 +325,6 @@ class VariedHumanoid(VariedSimulator):
         return self.state
 
 
-def photograph(states: Floats, *, height: int = 240, width: int = 200) -> NDArray[np.uint8]:
-    """Return a picture of each of the target states (K, 47), seen from its right, (K, height, width, 3)."""
-    os.environ.setdefault("MUJOCO_GL", "egl")
-    model = humanoid.humanoid_model()
-    data = mujoco.MjData(model)
-    try:
-        from gymnasium.envs.mujoco.mujoco_rendering import OffScreenViewer  # noqa: PLC0415 - slow
-
-        viewer = OffScreenViewer(model, data, width, height)
-    except (AttributeError, ImportError, RuntimeError, mujoco.FatalError) as error:
-        raise BadInputError(
-            f"expected OpenGL that works without a window, found none ({error}): set MUJOCO_GL to egl or osmesa"
-        ) from error
-    # Along y, so that x goes to the right.
-    viewer.cam.distance, viewer.cam.azimuth, viewer.cam.elevation = 3.8, 90.0, -8.0
-    pictures = []
-    for state in states:
-        data.qpos[:] = state[: humanoid.POSITIONS]
-        mujoco.mj_forward(model, data)
-        viewer.cam.lookat[:] = (*state[:2], 0.95)
-        pictures.append(viewer.render("rgb_array"))
-    return np.stack(pictures)
-
-
 _HORIZON = 1000  # of Gymnasium's Humanoid-v5: 15 s
 
 _COMMANDS = ("left_hip", "left_knee", "right_hip", "right_knee")
@@ -410,7 +383,6 @@ def _task(name: str, walking: Walking, kind: Kind, beyond: Callable[[Tensor], Te
         quantities=quantities,
         timestep_s=humanoid.TIMESTEP_S,
         simulator_id=f"humanoid_{name}",
-        photograph=photograph,
         facts={"stiffness": humanoid.STIFFNESS, "damping": humanoid.DAMPING, **humanoid.COMMAND_PARAMETERS},
         varied=Varied(VariedHumanoid, RANDOMIZED_ACTIONS, WIDE_RANGES),
     )

@@ -220,15 +220,6 @@ def test_the_same_seed_gives_the_same_outcome_on_any_number_of_threads(
         assert first[0][world] == second[0][world]
 
 
-def test_where_there_are_pictures_the_states_of_the_first_episode_are_kept(
-    task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(TASKS, task, replace(TASKS[task], photograph=lambda states: np.zeros((1, 2, 2, 3), np.uint8)))
-    told, paths = make(task, "follower", tmp_path / "out")
-    filmed, steps = paths["target.state"], int(told["target"]["steps"][0])
-    assert filmed.shape == (steps + 1, 29) and torch.equal(filmed[:, :2], paths["target.position"][0, : steps + 1])
-
-
 def test_an_episode_ends_with_its_success(
     task: str, trained: Path, grounded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -47,7 +47,6 @@ COMMAND = "astra-data run recipes/antmaze_u.toml"
 def task(**changes: object) -> SimpleNamespace:
     usual: dict[str, object] = {
         "name": "antmaze-u",
-        "photograph": None,
         "plane": U_MAZE,
         "ball_index": None,
         "facts": {},

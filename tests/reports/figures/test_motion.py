@@ -1,8 +1,7 @@
 import itertools
 import json
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import fake_runs
 import numpy as np
@@ -15,12 +14,10 @@ from safetensors.numpy import save_file
 from small_cart import TASK
 from torch import Tensor
 
-from astra_data.core.errors import BadInputError
 from astra_data.reports.figures.motion import (
     can_replay,
     dynamics_mismatch,
     replay_commands,
-    strips,
     trajectories,
 )
 from astra_data.reports.figures.style import DEPLOYED, SIMULATED, Scene
@@ -67,7 +64,6 @@ def write(
     if simulated:
         values["simulated"] = outcomes
         tensors["simulated.position"] = paths()[..., :positions]
-    tensors["target.state"] = np.zeros((40, 4))
     (folder / "evaluation.json").write_text(json.dumps(values))
     save_file(tensors, folder / "trajectories.safetensors")
 
@@ -127,41 +123,6 @@ def test_a_star_stands_at_the_mean_goal_of_each_cell_and_a_ball_has_a_path_of_it
     assert np.concatenate(stars) == pytest.approx(np.array([[-3.5, -3.8], [4.0, 4.0]]))
     dotted = [line for line in axes.lines if line.get_linestyle() == ":"]
     np.testing.assert_allclose(np.asarray(dotted[0].get_xydata()), paths()[0] + 0.5)
-
-
-@dataclass(frozen=True)
-class Filmed:
-    """A task that is photographed."""
-
-    photograph: Any
-    timestep_s: float = 0.1
-    objective: Any = TASKS["humanoid-walker2d"].objective
-
-
-def test_strips_have_a_picture_for_each_moment_until_the_end(scene: Scene) -> None:
-    write(scene.root, "nas")
-    write(scene.root, "astra")
-    taken = []
-
-    def photograph(states: NDArray[np.float64]) -> NDArray[np.uint8]:
-        taken.append(len(states))
-        return np.zeros((len(states), 8, 6, 3), dtype=np.uint8)
-
-    filmed = replace(scene, task=Filmed(photograph))  # type: ignore[arg-type]
-    figure = drawn(strips(results("nas", "astra"), filmed))
-    figure.canvas.draw()
-    # 40 states, 0.1 s apart: at 0, 0.5, 1, 1.5 and 2 s.
-    assert taken == [5, 5]
-    titles = [axes.get_title() for axes in figure.axes[:8]]
-    assert titles == ["0 s", "0.5 s", "1 s", "1.5 s", "2 s", "4 s", "8 s", "100 s"]
-    assert [len(axes.images) for axes in figure.axes[:8]] == [1] * 5 + [0] * 3
-    assert [text.get_text() for text in figure.axes[0].texts] == ["NAS", "4 s"]
-
-    def cannot(_: NDArray[np.float64]) -> NDArray[np.uint8]:
-        raise BadInputError("no display")
-
-    assert strips(results("nas"), replace(scene, task=Filmed(cannot))) is None  # type: ignore[arg-type]
-    assert strips(results("nas"), replace(scene, task=Filmed(None))) is None  # type: ignore[arg-type]
 
 
 def test_each_axis_of_a_mismatch_has_its_own_values_and_bands() -> None:

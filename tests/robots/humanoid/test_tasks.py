@@ -7,12 +7,10 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 from quick_runs import run_here
 from torch import Tensor
 from torch.nn import functional
 
-from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import GOAL
 from astra_data.dataset.reader import Dataset
 from astra_data.grounding.files import load_history_model
@@ -204,38 +202,6 @@ def test_walkers_have_the_damping_and_the_time_that_they_were_given() -> None:
         assert data.time == pytest.approx(0.015 * scale[row])
         landed = torch.tensor([*data.qpos[1:], *data.qvel]).float()
         torch.testing.assert_close(after[row, :13], landed, atol=1e-5, rtol=1e-5)
-
-
-def skin(picture: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Tell where a picture (height, width, 3) shows the body: it is reddish, floor and sky are not."""
-    red, _, blue = picture.astype(int).transpose(2, 0, 1)
-    return np.asarray(red > blue + 30)
-
-
-def test_the_camera_follows_who_walks_and_sees_who_lies() -> None:
-    states = np.tile(np.array(humanoid.STANDING), (3, 1))
-    states[1, 0] = 5.0
-    states[2, [2, *range(3, 7)]] = 0.1, *(0.5**0.5 * np.array([1.0, 0.0, 1.0, 0.0]))
-    try:
-        pictures = tasks.photograph(states, height=120, width=120)
-    except BadInputError as error:
-        pytest.skip(str(error))
-    assert pictures.shape == (3, 120, 120, 3)
-    standing, away, lying = map(skin, pictures)
-    assert (standing != away).mean() < 0.01
-    rows, columns = (np.flatnonzero(standing.any(axis=axis)) for axis in (1, 0))
-    assert np.ptp(rows) > 1.5 * np.ptp(columns)
-    rows, columns = (np.flatnonzero(lying.any(axis=axis)) for axis in (1, 0))
-    assert np.ptp(columns) > 1.5 * np.ptp(rows)
-
-
-def test_without_opengl_there_is_one_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    def none(*_: object) -> None:
-        raise ImportError("no libEGL")
-
-    monkeypatch.setattr("gymnasium.envs.mujoco.mujoco_rendering.OffScreenViewer", none)
-    with pytest.raises(BadInputError, match=r"OpenGL that works without a window.*no libEGL.*MUJOCO_GL"):
-        tasks.photograph(np.array([humanoid.STANDING]))
 
 
 HUMANOID_TASKS = (tasks.WALKER2D, tasks.KINEMATICS, tasks.EXTENDED)
