@@ -114,8 +114,6 @@ def _faults(method: Method) -> Iterator[str]:
         yield f"is grounded as {method.grounded_as}, which has another fit: expected the same"
     if isinstance(method.fit, HistoryFit) and given.get("reward") == "predicted" and not method.fit.reward:
         yield "is paid a reward that nothing predicts: expected HistoryFit(reward=True)"
-    if method.initial in METHODS and (METHODS[method.initial].grounds or not METHODS[method.initial].trains):
-        yield f"starts from the policy of {method.initial}: expected a method that learns one, and fits nothing"
     if grounding and (missing := _missing(grounding, "to_file", "from_file", "corrected", "simulator")):
         yield f"has a grounding, {grounding.__name__}, without {missing}: expected a subclass of FittedGrounding"
     if table is None:

@@ -192,7 +192,10 @@ class Recipe(Config):
                 if is_plus(row) and not method_named(row).in_simulator:
                     fault = "trains nothing in a simulator, so plus settings have no effect: leave out"
                     raise ValueError(f"'{row}' {fault} {PLUS}")
-                method_named(row)
+                initial = method_named(row).initial
+                if initial and (method_named(initial).grounds or not method_named(initial).trains):
+                    fault = f"'{row}' starts from the policy of {initial}"
+                    raise ValueError(f"{fault}: expected a method that learns one, and fits nothing")
         return rows
 
     @model_validator(mode="after")

@@ -1,5 +1,6 @@
 """Methods of one's own, as recipes name them."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -110,6 +111,19 @@ def test_results_that_were_published_with_other_settings_of_theirs_are_not_the_r
         load_experiment(recipe, tmp_path).published()
     published(other=True, **other)
     assert len(load_experiment(recipe, tmp_path).published()) == 1
+
+
+@pytest.mark.parametrize("initial", ["nas", "follower", "delta"])
+def test_what_a_policy_starts_from_is_learned_without_a_fit(
+    initial: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whichever of a recipe's methods is read first."""
+    monkeypatch.setitem(METHODS, "begun", replace(METHODS["direct_transfer_iql"], name="begun", initial=initial))
+    recipe = tmp_path / "r.toml"
+    text = 'task = "antmaze-umaze"\nmethods = ["begun"]\nseeds = [0]\n[collect]\n[user_methods]\n'
+    recipe.write_text(f'{text}delta = "{DELTA}"\n')
+    with pytest.raises(RecipeError, match=f"methods: 'begun' starts from the policy of {initial}: expected a method"):
+        load_experiment(recipe, tmp_path)
 
 
 @pytest.mark.parametrize("row", ["delta", "delta_plus", "astra"])
