@@ -25,6 +25,7 @@ _FIELDS = {0: (5, 2), _DICTIONARY: (7, 2), _DATA_V2: (8, 4)}
 _FIXED_WIDTH = (0, 9)  # encodings PLAIN and BYTE_STREAM_SPLIT
 _HEADER = 1000  # upper bound of a page header in bytes, including the extremes of its values
 _SNAPPY, _ZSTD, _ZSTD_MAGIC = 1, 6, b"\x28\xb5\x2f\xfd"
+_PIECES = 256  # of a row group that has rows which cannot be read
 _IMAGE = pa.struct({"bytes": pa.binary(), "path": pa.string()})
 TRUE, FALSE, BYTE, I16, I32, I64 = range(1, 7)
 BINARY, LIST, STRUCT = 8, 9, 12
@@ -159,25 +160,26 @@ def _stretches(file: pq.ParquetFile, columns: Sequence[plain.PlainColumn]) -> It
         end = first + file.metadata.row_group(group).num_rows
         try:
             table = file.read_row_group(group, columns=[column.name for column in columns], use_threads=False)
-            yield from _readable(first, table, columns)
+            yield from _readable(first, table, columns, max(1, len(table) // _PIECES))
         except (*UNREADABLE, CorruptDatasetError) as error:
             yield first, end, in_short(error)
         first = end
 
 
 def _readable(
-    first: int, table: pa.Table, columns: Sequence[plain.PlainColumn]
+    first: int, table: pa.Table, columns: Sequence[plain.PlainColumn], least: int
 ) -> Iterator[tuple[int, int, pa.Table | str]]:
-    """Yield a table, from the row `first` on, or its halves where a value of it cannot be read."""
+    """Yield a table, from the row `first` on, or its halves, of `least` rows, where a value of it cannot be read."""
     try:
         if not plain.schema_faults(table.schema, columns):
             plain.block_values(table, columns)
     except CorruptDatasetError as error:
-        if (half := len(table) // 2) == 0:
-            yield first, first + 1, in_short(error)
+        if len(table) <= least:
+            yield first, first + len(table), in_short(error)
             return
-        yield from _readable(first, table[:half], columns)
-        yield from _readable(first + half, table[half:], columns)
+        half = len(table) // 2
+        yield from _readable(first, table[:half], columns, least)
+        yield from _readable(first + half, table[half:], columns, least)
     else:
         yield first, first + len(table), table
 
