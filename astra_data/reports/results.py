@@ -17,7 +17,7 @@ from astra_data.grounding.paired_episodes import BINS
 from astra_data.methods import grounded_as, method_role, method_title
 from astra_data.reports.artifacts import Machine
 from astra_data.reports.choice import Choice, Judgment, Trials, choice_of
-from astra_data.reports.statistics import Estimate, paired_difference, summarize
+from astra_data.reports.statistics import LEAST_SEEDS, Estimate, paired_difference, summarize
 from astra_data.worlds.objective import SUCCESS, Score
 
 if TYPE_CHECKING:
@@ -162,8 +162,10 @@ class Results(Facts):
         return [row for row in self.rows if row in known]
 
     def contenders(self) -> list[str]:
-        """Return the methods tested at the largest size that are no references."""
-        return [row for row in self.tested(self.largest) if not method_role(row)]
+        """Return the methods tested at the largest size that are no references, on enough seeds where any is."""
+        rows = [row for row in self.tested(self.largest) if not method_role(row)]
+        seeds = {row: len(self.values(row, self.headline.measure)) for row in rows}
+        return [row for row in rows if seeds[row] >= min(LEAST_SEEDS, max(seeds.values()))]
 
     def values(self, row: str, measure: str, where: str = TESTED, percent: int | None = None) -> dict[int, float]:
         """Return the value of a measure by seed, at a size, by default the largest."""

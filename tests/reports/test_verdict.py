@@ -55,6 +55,12 @@ def test_the_best_method_is_deployed_with_its_best_seed() -> None:
     assert "Deploy" in found.text and "none" not in found.text
 
 
+def test_a_lucky_seed_or_two_are_not_compared_with_three() -> None:
+    assert verdict_of(results(FLOOR | {"nas": GOOD, "compass": (1.0, 1.0)})).row == "nas"
+    assert verdict_of(results(FLOOR | {"nas": GOOD[:2], "compass": (1.0,)})).row == "nas"
+    assert verdict_of(results(FLOOR | {"nas": (*GOOD, 0.9), "compass": (1.0,) * 3})).row == "compass"
+
+
 def test_a_method_that_did_not_learn_its_own_simulator_is_the_reason_to_deploy_none() -> None:
     target = FLOOR | {"nas": (0.19,) * 3, "astra": (0.1,) * 3}
     simulated = {"nas": (0.9,) * 3, "astra": (0.03,) * 3}
