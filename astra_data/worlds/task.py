@@ -385,8 +385,8 @@ class Task:
     @property
     def plane(self) -> Maze | None:
         """The maze; None where there is none."""
-        maze: Maze | None = getattr(self.objective, "maze", None)
-        return maze
+        maze = getattr(self.objective, "maze", None)  # a user's may be anything
+        return maze if isinstance(maze, Maze) else None
 
     @property
     def maze(self) -> Maze:

@@ -131,6 +131,11 @@ def test_a_ball_on_a_beam_has_no_place_in_a_plane() -> None:
     assert replace(task, name="beam").ball_index is None
 
 
+def test_what_a_user_calls_a_maze_is_no_plane(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(type(TASK.objective), "maze", "a hedge", raising=False)
+    assert TASK.plane is None
+
+
 def test_simulators_of_a_task_take_actions_and_commands() -> None:
     action = torch.tensor([[1.0], [-1.0]])
     torch.testing.assert_close(TASK.simulator(2).step(action), torch.tensor([[0.4], [-0.1]]))
