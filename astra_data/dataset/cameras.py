@@ -152,12 +152,11 @@ def read_cameras(root: Path, info: Mapping[str, Any]) -> dict[str, Camera]:
 
 def _rows(root: Path, names: Sequence[str], camera: str) -> Iterator[tuple[int, list[Any], dict[str, Any]]]:
     """Yield the number of each episode, its values `names`, and its statistics of a camera."""
-    stored, number = {f"stats/{camera}/{key}": key for key in layout.STORED_STATISTICS}, "episode_index"
-    for row in (
-        row for block in read_blocks(episodes_files(root), [number, *names, *stored]) for row in block.to_pylist()
-    ):
-        known = {key: row[name] for name, key in stored.items() if row.get(name) is not None}
-        yield row[number], [row[name] for name in names], known
+    stored = {f"stats/{camera}/{key}": key for key in layout.STORED_STATISTICS}
+    for block in read_blocks(episodes_files(root), [EPISODE_INDEX, *names, *stored]):
+        for row in block.to_pylist():
+            known = {key: row[name] for name, key in stored.items() if row.get(name) is not None}
+            yield row[EPISODE_INDEX], [row[name] for name in names], known
 
 
 def _of_video(root: Path, info: Mapping[str, Any], name: str) -> Iterator[tuple[int, Clip]]:

@@ -303,9 +303,10 @@ def run_faults(run: Run, *, number: int, row: int, fps: float) -> Iterator[tuple
             where = f"episode {number} frame {at[0]}" + (f" index {at[1]}" if len(at) > 1 else "")
             wanted = f", expected {expected[name][at]}" if name in expected else ", expected a finite number"
             more = f" ({int(wrong.sum())} values are wrong)" if wrong.sum() > 1 else ""
-            steps = np.diff(values) if name == names.TIMESTAMP and len(values) > 1 else np.full(1, np.nan)
-            if np.abs(steps - steps.mean()).max() < 0.01 * steps.mean() < np.abs(steps.mean() - 1 / fps):
-                more += f": they are {1 / steps.mean():.4g} a second, the fps of {layout.INFO_PATH} is {fps:g}"
+            if name == names.TIMESTAMP and len(values) > 1:
+                step = (steps := np.diff(values)).mean()
+                if np.abs(steps - step).max() < 0.01 * step < np.abs(step - 1 / fps):
+                    more += f": they are {1 / step:.4g} a second, the fps of {layout.INFO_PATH} is {fps:g}"
             yield name, f"{name} is {values[at]} in {where}{wanted}{more}"
 
 

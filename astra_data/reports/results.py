@@ -165,7 +165,8 @@ class Results(Facts):
         """Return the methods tested at the largest size that are no references, on enough seeds where any is."""
         rows = [row for row in self.tested(self.largest) if not method_role(row)]
         seeds = {row: len(self.values(row, self.headline.measure)) for row in rows}
-        return [row for row in rows if seeds[row] >= min(LEAST_SEEDS, max(seeds.values()))]
+        least = min(LEAST_SEEDS, max(seeds.values(), default=0))
+        return [row for row in rows if seeds[row] >= least]
 
     def values(self, row: str, measure: str, where: str = TESTED, percent: int | None = None) -> dict[int, float]:
         """Return the value of a measure by seed, at a size, by default the largest."""

@@ -267,9 +267,8 @@ def _seen(
         if fault and not (folder / layout.OUR_FOLDER).is_dir():
             with suppress(CorruptDatasetError, LookupError, TypeError, ValueError):
                 clips = dict(clips_of_runs(folder, remains.info, name, (run for _, run in whole([])))) | clips
-        unseen = [clip_fault(clip) for clip in clips.values()]
-        if all(unseen):
-            notes.append(f"{name} is left out: {fault or unseen[0]}")
+        if all(map(clip_fault, clips.values())):  # up to the first that can be read
+            notes.append(f"{name} is left out: {fault or next(map(clip_fault, clips.values()), 'there is no episode')}")
             continue
         notes += [f"{name}: {fault}"] if fault else []
         cameras[name] = Camera(feature, clips)
