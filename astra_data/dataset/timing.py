@@ -66,8 +66,11 @@ def trim(
         left[first : max(0, len(episode) - last)] = True
         if still:
             state = as_rows(episode.columns[names.STATE])
-            after = as_rows(episode.columns.get(names.NEXT_STATE, np.concatenate([state[1:], state[-1:]])))
-            moving = np.flatnonzero(left & (state != after).any(axis=1))
+            moves = (state[1:] != state[:-1]).any(axis=1)
+            moves = np.append(moves, moves[-1:].any())  # an unknown last step goes on as the one before
+            if names.NEXT_STATE in episode.columns:
+                moves = (state != as_rows(episode.columns[names.NEXT_STATE])).any(axis=1)
+            moving = np.flatnonzero(left & moves)
             left[: moving[0] if moving.size else None] = left[moving[-1] + 1 if moving.size else 0 :] = False
         return left & ~condition(episode) if condition else left
 

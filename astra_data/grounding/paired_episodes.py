@@ -20,6 +20,7 @@ from astra_data.worlds.task import Task
 
 BINS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # edges of the probabilities in a reliability diagram
 RISK_STEPS = 20  # steps before each failure that `PairedWindows.fails_soon` marks
+_LONG_STEPS, _LONG_RATIO = 2000, 8  # episodes of over so many steps, and over so many times the mean, are cut
 _COLUMNS = (
     *(names.STATE, names.ACTION, names.TERMINATED),
     *(names.ABSTRACT_STATE, names.ABSTRACT_NEXT_STATE, names.ABSTRACT_SIMULATED_NEXT_STATE),
@@ -70,7 +71,7 @@ def draw_steps(lengths: Tensor, count: int, length: int) -> tuple[Tensor, Tensor
 
 @dataclass(frozen=True)
 class PairedEpisodes:
-    """E paired episodes, padded at the end to T steps."""
+    """E paired episodes, or pieces of those far longer than most, padded at the end to T steps."""
 
     target_state: Tensor  # s_i, or the inputs in its place, (E, T, S)
     reward: Tensor  # the target's, r_i, (E, T)
@@ -91,10 +92,13 @@ class PairedEpisodes:
         return {"dataset": self.reference, "hash": self.content_hash}
 
     @classmethod
-    def load(cls, root: str | Path, device: str = "cpu", inputs: Sequence[str] = ()) -> "PairedEpisodes":
+    def load(
+        cls, root: str | Path, device: str = "cpu", inputs: Sequence[str] = (), *, whole: bool = False
+    ) -> "PairedEpisodes":
         """Read the paired dataset at `root`, actions as ±1; a last step that was made up joins the one before.
 
-        The columns `inputs`, one after another, stand in for the target's state.
+        The columns `inputs`, one after another, stand in for the target's state. Unless `whole`, episodes far
+        longer than most come in pieces.
         """
         dataset = open_dataset(root)
         if names.ABSTRACT_STATE not in dataset.features:
@@ -110,6 +114,9 @@ class PairedEpisodes:
                     f"{root}: no step is left: each episode has a single one, whose next state was made up"
                 )
             uids, lengths, recordings, held_out = uids[left], lengths[left], recordings[left], held_out[left]
+        if not whole:
+            lengths, cut = _pieces(lengths)
+            uids, recordings, held_out = uids[cut], recordings[cut], held_out[cut]
         bounds = dataset.description["simulator"].get("commands")
         commands = Commands({name: tuple(ends) for name, ends in bounds.items()}) if bounds else None
         padded = {}
@@ -255,6 +262,15 @@ def _merged(
     kept = np.ones(int(lengths.sum()), dtype=bool)
     kept[(lengths.cumsum() - 1)[merged]] = False
     return {name: values[kept] for name, values in left.items()}, lengths - merged
+
+
+def _pieces(lengths: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
+    """Return the lengths of the pieces of episodes, and which episode each is of; a long one would pad all others."""
+    longest = max(_LONG_STEPS, int(_LONG_RATIO * lengths.mean()))
+    counts = -(-lengths // longest)
+    pieces = np.full(counts.sum(), longest)
+    pieces[counts.cumsum() - counts] = lengths - (counts - 1) * longest  # the first is the short one, as ends matter
+    return pieces, np.repeat(np.arange(len(lengths)), counts)
 
 
 def _dropped_place(dataset: Dataset) -> tuple[int, ...]:

@@ -2,8 +2,9 @@
 
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from inspect import signature
 from pathlib import Path
 from typing import get_args
 
@@ -84,14 +85,18 @@ def _faults(method: Method) -> Iterator[str]:
         yield f'has the color {method.color!r}: expected "#rrggbb"'
     choices = {"role": (None, *get_args(Role)), "learns_from": get_args(Source), "configures": ("ground", "train")}
     choices |= {"reward": get_args(RewardSource), "ranges": (None, "randomized", "wide")}
-    given = vars(method) | (vars(method.learn) if isinstance(method.learn, InSimulator) else {})
+    values = vars(method) | (vars(method.learn) if isinstance(method.learn, InSimulator) else {})
     for name, known in choices.items():
-        if (value := given.get(name, known[0])) not in known:
+        if (value := values.get(name, known[0])) not in known:
             yield f"has {name}={value!r}: expected {', '.join(map(repr, known))}"
-    for name in ("fit", "learn"):
-        if (value := getattr(method, name)) is not None and not callable(value):
-            yield f"has {name}={value!r}: expected a function"
+    if not isinstance(method.title, str):
+        yield f"has title={method.title!r}: expected text"
     table, grounding, learn = method.table, method.grounding, method.learn
+    functions: dict[str, tuple[Callable[..., object] | None, str]] = {"fit": (method.fit, "fitting")}
+    functions["learn"] = (learn.learn, "env, training") if isinstance(learn, UserLearner) else (learn, "training")
+    for name, (function, given) in functions.items():
+        if function is not None and not _takes(function, given.split()):
+            yield f"has {name}={function!r}: expected a function {name}({given})"
     if table is not None and not isinstance(table, Table):
         yield f"has table={table!r}: expected a Table of its name in recipes and the class of its settings"
         return
@@ -112,7 +117,7 @@ def _faults(method: Method) -> Iterator[str]:
         yield f"has {', '.join(used)}, and nothing is fitted: expected fit"
     elif method.grounded_as in METHODS and METHODS[method.grounded_as].fit != method.fit:
         yield f"is grounded as {method.grounded_as}, which has another fit: expected the same"
-    if isinstance(method.fit, HistoryFit) and given.get("reward") == "predicted" and not method.fit.reward:
+    if isinstance(method.fit, HistoryFit) and values.get("reward") == "predicted" and not method.fit.reward:
         yield "is paid a reward that nothing predicts: expected HistoryFit(reward=True)"
     if grounding and (missing := _missing(grounding, "to_file", "from_file", "corrected", "simulator")):
         yield f"has a grounding, {grounding.__name__}, without {missing}: expected a subclass of FittedGrounding"
@@ -125,6 +130,17 @@ def _faults(method: Method) -> Iterator[str]:
         yield 'has settings that nothing reads: configures="ground" needs fit'
     elif method.configures == "train" and type(method.learn) is InSimulator:
         yield 'has settings that nothing reads: expected configures="ground" if they are those of fit'
+
+
+def _takes(function: Callable[..., object], given: Sequence[str]) -> bool:
+    """Return whether `function` can be called with as many arguments; what is built in does not tell."""
+    try:
+        signature(function).bind(*given)
+    except TypeError:
+        return False
+    except ValueError:
+        return True
+    return True
 
 
 def _missing(made: type, *needed: str) -> str:

@@ -43,7 +43,7 @@ def view_run(run: Path, uids: Sequence[int] = (), *, seed: int | None = None, sa
     pairs = next(run / item.key for item in items if item.stage == "pair")
     if not pairs.is_dir():
         raise BadInputError(f"{run} has no pairs of seed {seeds[0]} yet: run the recipe until pair")
-    dataset, held_out = Dataset.open(pairs), (episodes := PairedEpisodes.load(pairs))
+    dataset, held_out = Dataset.open(pairs), (episodes := PairedEpisodes.load(pairs, whole=True))
     check_uids(dataset, uids)
     simulators: dict[str, Grounding] = {"raw": NO_GROUNDING}
     for item in items:
@@ -53,7 +53,7 @@ def view_run(run: Path, uids: Sequence[int] = (), *, seed: int | None = None, sa
             share, drawn = item.call.keywords["config"].held_out_share, item.call.keywords["seed"]
             if (data := item.call.keywords["dataset"]).is_dir():
                 check_made_from(made, {"dataset": Dataset.open(data).content_hash})
-            whole = PairedEpisodes.load(data) if data.is_dir() and data != pairs else episodes
+            whole = PairedEpisodes.load(data, whole=True) if data.is_dir() and data != pairs else episodes
             held_out = whole.split(share, drawn)[1]
             simulators[row_of_key(item.key)] = load_grounding(made)
     wanted = torch.tensor(uids or held_out.uids[:5].tolist())

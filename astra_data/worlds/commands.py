@@ -1,6 +1,7 @@
 """Commands in their own units, and as policies give them, ±1 along each axis; simulators driven so."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Self
 
@@ -30,9 +31,8 @@ class Commands(dict[str, tuple[float, float]]):
     def __init__(self, bounds: Mapping[str, tuple[float, float]]) -> None:
         """Take the bounds (least, largest) of each axis, in the units of the robot's commands."""
         faults = [] if bounds else ["no axis is named"]
-        for name, ends in bounds.items():
-            if np.shape(ends) != (2,) or not np.isfinite(ends).all() or not ends[0] < ends[1]:
-                faults.append(f"{name}: expected (least, largest), got {ends!r}")
+        wrong = {name: ends for name, ends in bounds.items() if not _is_range(ends)}
+        faults += [f"{name}: expected (least, largest), got {ends!r}" for name, ends in wrong.items()]
         if faults:
             raise BadInputError(f"commands: {'; '.join(faults)}")
         super().__init__({name: (float(low), float(high)) for name, (low, high) in bounds.items()})
@@ -67,6 +67,14 @@ class Commands(dict[str, tuple[float, float]]):
             return command
         middle, half = map(torch.from_numpy, (self._middle, self._half))
         return (command - middle.to(command.device)) / half.to(command.device)
+
+
+def _is_range(ends: Iterable[float]) -> bool:
+    """Return whether `ends` are two numbers, of which float32 knows the second as the larger one."""
+    with suppress(TypeError, ValueError, OverflowError), np.errstate(over="ignore", invalid="ignore"):
+        low, high = (np.float32(float(end)) for end in ends)
+        return bool(0 < high - low < np.inf)
+    return False
 
 
 class DrivenSimulator:

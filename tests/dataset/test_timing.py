@@ -91,6 +91,16 @@ def test_still_ends_go_and_pauses_stay(tmp_path: Path) -> None:
         trim(blind, still=True, out=tmp_path / "none")
     (found,) = made(trim(logs, still=True, out=tmp_path / "out"))
     assert found.columns[STATE].tolist() == [0, 1, 1] and found.columns[NEXT_STATE].tolist() == [1, 1, 2]
+    # Without next states, the last step goes on as the one before.
+    short = write_fake(
+        tmp_path / "short",
+        [Episode(uid, {STATE: now[:6]}) for uid, now in enumerate((x, x[2:]))],
+        columns=[Column(STATE)],
+    )
+    assert [one.columns[STATE].tolist() for one in made(trim(short, still=True, out=tmp_path / "moved"))] == [
+        [0, 1, 1, 2],
+        [0, 1, 1],
+    ]
 
 
 @pytest.mark.parametrize(

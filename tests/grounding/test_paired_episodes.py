@@ -12,6 +12,7 @@ from astra_data.dataset import columns as keys
 from astra_data.dataset.edit import filter_episodes
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.writer import DatasetWriter
+from astra_data.grounding import paired_episodes
 from astra_data.grounding.paired_episodes import PairedEpisodes, draw_steps
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.commands import Commands
@@ -123,6 +124,21 @@ def test_rewards_are_as_recorded_and_what_ends_an_episode_is_marked(episodes: Pa
 
 def test_only_the_last_second_before_a_bad_end_fails_soon(episodes: PairedEpisodes) -> None:
     assert episodes.windows.fails_soon.nonzero().tolist() == [[3, step] for step in range(10, 30)]
+
+
+def test_an_episode_far_longer_than_most_comes_in_pieces_of_one_recording(
+    root: Path, episodes: PairedEpisodes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(paired_episodes, "_LONG_STEPS", 8)
+    monkeypatch.setattr(paired_episodes, "_LONG_RATIO", 1)  # times the mean, 11
+    cut = PairedEpisodes.load(root)
+    assert cut.lengths.tolist() == [7, 1, 1, 11, 8, 11, 11, 5]
+    assert cut.uids.tolist() == cut.recordings.tolist() == [0, 1, 2, 2, 3, 3, 3, 4]
+    assert torch.equal(cut.steps(cut.target_state), episodes.steps(episodes.target_state))
+    assert cut.windows.failed.nonzero().tolist() == [[6, 10]] and cut.windows.fails_soon.sum() == 11
+    assert PairedEpisodes.load(root, whole=True).lengths.tolist() == list(LENGTHS)
+    monkeypatch.setattr(paired_episodes, "_LONG_STEPS", 30)
+    assert PairedEpisodes.load(root).lengths.tolist() == list(LENGTHS)
 
 
 def test_a_split_is_by_episodes_and_by_the_seed(episodes: PairedEpisodes) -> None:

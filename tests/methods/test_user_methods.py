@@ -272,6 +272,7 @@ def test_what_is_no_method_is_refused_in_one_line(tmp_path: Path, name: str, pla
 
 
 HEAD = """
+from functools import partial
 from pydantic import BaseModel
 from astra_data.core.config import Config
 from astra_data.methods.astra import DIRECT_TRANSFER
@@ -290,7 +291,7 @@ class Whole(FittedGrounding):
 class Kept:
     to_file, from_file = 1, 2
 def fit(fitting): ...
-METHOD = Method(name="", title="",
+METHOD = partial(Method, name="", title="")(
 """
 
 
@@ -308,7 +309,9 @@ METHOD = Method(name="", title="",
         ("grounding=Whole, grounded_as='nas'", "has grounding, grounded_as, and nothing is fitted: expected fit"),
         ("fit=fit, grounded_as='nas'", "is grounded as nas, which has another fit: expected the same"),
         ("aligns=True", "has aligns, and nothing is fitted: expected fit"),
-        ("fit='fit', learn=5", "has fit='fit': expected a function; .*mine.py:METHOD has learn=5: expected a function"),
+        ("fit='fit', learn=5", r"has fit='fit': expected a function fit\(fitting\); .*mine.py:METHOD has learn=5: exp"),
+        ("learn=UserLearner(learn=fit, policy=Half)", r"has learn=<function fit at .*: .* learn\(env, training\)"),
+        ("fit=lambda fitting, extra: None", r"has fit=<function <lambda> at .*: expected a function fit\(fitting\)"),
         ("table=Ours", "has table=<class '.*Ours'>: expected a Table of its name in recipes and the class of its"),
         ("fit=HistoryFit(latent=True, reward=False, encoder=Kept())", "has an object as encoder: expected its class"),
         ("fit=HistoryFit(latent=True, reward=False, encoder=Kept)", "has an encoder, Kept, without kind, a string, i"),
@@ -320,6 +323,7 @@ METHOD = Method(name="", title="",
         ("fit=fit, grounding=object(), table=Table('mine', Ours())", "has an object as grounding, table: expected its"),
         ("learn=UserLearner(learn=fit, policy=Kept())", "has an object as policy: expected its class"),
         ("learn=UserLearner(learn=fit, policy=Kept)", "learns a Kept, without kind, a string, act: expected the cl"),
+        ("title=3", "has title=3: expected text"),
         ("color='banana'", "has the color 'banana': expected \"#rrggbb\""),
         ("role='roof'", "has role='roof': expected None, 'floor', 'ceiling', 'trained there'"),
         ("learns_from='logs', configures='grond'", "has learns_from='logs': .*; .*has configures='grond': expected 'g"),

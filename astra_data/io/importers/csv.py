@@ -125,11 +125,11 @@ def _joined(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     numbers = [time, *_plain(mapping.fields)]
     main, *rest = mapping.files
     tables: dict[str, dict[str, Array]] = {}
-    is_torn = False
+    torn = []
     for name in (main, *rest):
         fields = [time, *_plain(f for f in mapping.all_fields if f.startswith(f"{name}:"))]
         block = _read(source.parts[name], fields, numbers)
-        is_torn |= name == main and block is not None and block.torn > 0
+        torn += [name] if block and block.torn else []
         tables[name] = {
             f"{name}:{field}" if field != time else time: np.asarray(block.values[field]) if block else np.empty(0)
             for field in fields
@@ -152,15 +152,16 @@ def _joined(source: Source, mapping: ImportMapping) -> Iterator[Block]:
         raise BadInputError(f"{source}: no row has rows of {', '.join(rest)} before it that are recent enough")
     begins = np.flatnonzero(np.diff(kept, prepend=-2) > 1).tolist()
     lost = f"left out {len(now) - len(kept)} rows without recent enough ones of {', '.join(rest)}"
-    notes = (lost,) if len(kept) < len(now) else ()
+    notes = [f"left out the last line of {name}, which is cut off" for name in torn if name != main]
+    notes += [lost] if len(kept) < len(now) else []
 
     def line(row: int) -> int:
         return line_of(source.parts[main], int(kept[row]) if row < len(kept) else len(now))
 
     for first, rows in zip(begins, np.split(kept, begins[1:]), strict=False):
         part = {field: column[rows] for field, column in values.items()}
-        torn = is_torn and first == begins[-1]
-        yield Block(part, str(source), first > 0, torn, notes=() if first else notes, line=line, row=first)
+        is_torn = main in torn and first == begins[-1]
+        yield Block(part, str(source), first > 0, is_torn, notes=() if first else tuple(notes), line=line, row=first)
 
 
 def _plain(fields: Iterable[str]) -> list[str]:

@@ -150,6 +150,8 @@ def test_files_of_one_recording_are_joined_by_time(tmp_path: Path) -> None:
     joined(tmp_path / "logs/other", "", lost=slice(20, 30))
     with (tmp_path / "logs/other/state.csv").open("a") as cut_off:
         cut_off.write("4000,4")
+    with (tmp_path / "logs/other/control_state.csv").open("a") as cut_off:
+        cut_off.write("43")
     dataset, report = imported(tmp_path, tmp_path / "logs", JOINED)
     assert (report.tally.torn_rows, report.tally.torn_first) == (1, "other/state.csv line 42")
     before, after, first = dataset.episodes()
@@ -163,6 +165,7 @@ def test_files_of_one_recording_are_joined_by_time(tmp_path: Path) -> None:
     assert len(dataset.description["config"]["recordings"]) == 4
     lost = "left out {} rows without recent enough ones of control_state.csv"
     assert all(lost.format(rows) in str(report) for rows in (3, 6))
+    assert "left out the last line of control_state.csv, which is cut off" in str(report)
     (state := tmp_path / "logs/run1_state.csv").write_text(state.read_text().replace("\n900,", "\n,"))
     with pytest.raises(BadInputError, match=r"t in 1 row, run1_state\.csv line 11"):
         imported(tmp_path / "again", tmp_path / "logs", JOINED)
