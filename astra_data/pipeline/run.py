@@ -97,7 +97,7 @@ def run(
     part = selected(experiment.recipe, methods, seeds, percents)
     planned = plan(experiment.recipe, recipe_path, experiment.folder, part, device=device)
     items = [item for item in planned if item.stage in wanted]
-    make(experiment, items, planned, jobs=jobs, device=device, engine=engine, address=address, points=part.points())
+    make(experiment, items, planned, part, jobs=jobs, device=device, engine=engine, address=address)
     if "ground" in wanted:
         write_errors(experiment, part)
     if until in ("pair", "ground"):
@@ -126,6 +126,7 @@ def write_diagnosis(experiment: Experiment, part: Selection) -> None:
             with shown("diagnosis") as progress:
                 found = diagnose(paired, recipe.task, progress)
         except BadInputError as error:  # no reason to fail: the pairs are made
+            (experiment.folder / DIAGNOSIS).unlink(missing_ok=True)  # of other pairs
             _log.warning("%s is not written: %s", DIAGNOSIS, error)
             return
         page = diagnosis_page(experiment.path.stem, found, task_named(recipe.task).timestep_s)
@@ -161,7 +162,7 @@ def run_stage(
     planned = plan(
         recipe, recipe_path, folder, selection, device=device, reports=selection, publish=results, published=published
     )
-    make(experiment, _selected(planned, stage, methods), planned, jobs=jobs, device=device)
+    make(experiment, _selected(planned, stage, methods), planned, selection, jobs=jobs, device=device)
     return folder / stage
 
 
@@ -206,18 +207,19 @@ def make(
     experiment: Experiment,
     items: Collection[Item],
     planned: Collection[Item],
+    part: Selection,
     *,
     jobs: int | None = None,
     device: str = "cpu",
     engine: str = "processes",
     address: str | None = None,
-    points: Mapping[str, Owner] | None = None,
 ) -> None:
     """Make those of an experiment's `items` that are not finished yet, damaged or stale.
 
-    What is made again is set aside. The `items` stand after those they read, which are among `planned`. Those of
-    `points` that finish are shown, and written with all others.
+    What is made again is set aside. The `items` stand after those they read, which are among `planned`. Points of
+    `part` that finish are shown, and written with all others.
     """
+    asked, points = items, part.points()
     check_device(device, engine, address)
     recipe, folder = experiment.recipe, experiment.folder
     with folder_for(folder / RECORD), alone_in(folder):
@@ -243,9 +245,7 @@ def make(
         if digests := digests_of(recipe.task, recipe.user_methods):
             write_file(folder / CODE, json.dumps(recorded_code(folder) | digests, indent=1) + "\n")
         experiment.write_made_with(items)
-        points = points or {}
-        if points:
-            _write_points(experiment)
+        _write_points(experiment)
 
         def finished(key: str) -> None:
             if key in points:
@@ -262,6 +262,10 @@ def make(
                 prepare=partial(_prepare, dict(recipe.user_methods)),
                 address=address,
             )
+    made = {item.key for item in items}
+    # What was missing may be another now, such as a policy that was removed and is trained on another machine.
+    if any(made.intersection(one.inputs) for one in asked if one.key not in made) and to_make_again(asked, experiment):
+        make(experiment, asked, planned, part, jobs=jobs, device=device, engine=engine, address=address)
 
 
 def _prepare(user_methods: dict[str, UserMethod]) -> None:
@@ -315,7 +319,9 @@ def _selected(items: tuple[Item, ...], stage: str, methods: Sequence[str]) -> li
 def _write_points(experiment: Experiment) -> dict[str, dict[str, Any]]:
     """Write the lines of all points that are finished now, if there are any, to `sweep.csv`, and return them."""
     points = selected(experiment.recipe).points().items()
-    lines = {key: _line(experiment, key, one) for key, one in points if (experiment.folder / key).is_dir()}
+    lines = {
+        key: _line(experiment, key, one) for key, one in points if (experiment.folder / key / EVALUATION).is_file()
+    }
     if lines:
         text = StringIO()
         writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")

@@ -102,8 +102,7 @@ def _facts(results: Results) -> Iterator[Block]:
         for percent in results.percents
         if (lacking := [row for row in results.rows if row not in results.tested(percent)])
     ]
-    asked, sweep = results.settings.get("seeds"), results.settings.get("sweep")
-    sizes = sweep.get("percent") if isinstance(sweep, dict) else None
+    sizes, asked = results.sizes, results.settings.get("seeds")
     for words, wanted, made in (("{} % of the data", sizes, results.percents), ("seeds {}", asked, results.seeds)):
         if lacking := [str(one) for one in wanted if one not in made] if isinstance(wanted, list) else []:
             unfinished.append(words.format(", ".join(lacking)))

@@ -155,6 +155,13 @@ class Results(Facts):
         """The largest size of the dataset."""
         return (self.percents or [WHOLE])[-1]
 
+    @property
+    def sizes(self) -> list[JsonValue]:
+        """The sizes of the dataset that the recipe sweeps over; empty where it does not."""
+        sweep = self.settings.get("sweep")
+        sizes = sweep.get("percent") if isinstance(sweep, dict) else None
+        return sizes if isinstance(sizes, list) else []
+
     def tested(self, percent: int | None = None) -> list[str]:
         """Return the methods that are tested at a size, by default at any."""
         sizes = self.percents if percent is None else [percent]
@@ -177,9 +184,9 @@ class Results(Facts):
     def summary(self, row: str, measure: str, where: str = TESTED, percent: int | None = None) -> Estimate | None:
         """Return a measure over the seeds that have it; None where there are none."""
         values = self.values(row, measure, where, percent)
-        return summarize([*values.values()], **self._bounds(measure)) if values else None
+        return summarize([*values.values()], **self.bounds(measure)) if values else None
 
-    def _bounds(self, measure: str) -> dict[str, Any]:
+    def bounds(self, measure: str) -> dict[str, Any]:
         """Return `limit` and `trials` of a measure, as the statistics take them."""
         limits = {score.measure: score.limit for score in self.scores} | dict.fromkeys(SHARES, 1.0)
         return {"limit": limits.get(measure), "trials": self.episodes if measure in SHARES else 0}
@@ -191,7 +198,7 @@ class Results(Facts):
     def difference(self, row: str, other: str) -> Estimate | None:
         """Return by how much a method's headline score is higher, paired by seed."""
         measure = self.headline.measure
-        return paired_difference(self.values(row, measure), self.values(other, measure), **self._bounds(measure))
+        return paired_difference(self.values(row, measure), self.values(other, measure), **self.bounds(measure))
 
     def groundings(self) -> list[str]:
         """Return the methods that ground a simulator, those of the tested methods first."""

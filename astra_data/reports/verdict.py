@@ -1,21 +1,23 @@
 """Which method to deploy, by a short rule, and the lines that the page and the terminal show of it.
 
-The best method is the one with the highest mean score over seeds, references apart. It is deployed if it succeeds in
-half of the episodes or more (for scores without a limit: always), fails in less than a third of them, and no floor does
-as well. Otherwise none is, for these reasons: a method did not learn to do the task in the simulator of its training;
-what was learned there is lost in the target; the best fails too often.
+The best method is the one with the highest mean score over seeds, references apart; two are compared on the seeds that
+both have. It is deployed if it succeeds in half of the episodes or more (for scores without a limit: always), fails in
+less than a third of them, and no floor does as well. Otherwise none is, for these reasons: a method did not learn to do
+the task in the simulator of its training; what was learned there is lost in the target; the best fails too often.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import fmean
+from typing import Any
 
 import numpy as np
 
 from astra_data.methods import grounded_as, method_role, method_title
 from astra_data.reports.blocks import listed
-from astra_data.reports.results import SIMULATED, WHOLE, Results, judged_horizon
-from astra_data.reports.statistics import LEAST_SEEDS, Estimate, interval, summarize
+from astra_data.reports.results import SIMULATED, Results, judged_horizon
+from astra_data.reports.statistics import LEAST_SEEDS, Estimate, interval, paired_difference, summarize
 
 ENOUGH = 0.5
 """Share of the largest possible score from which a method can be deployed, and has learned its own simulator; also the
@@ -29,7 +31,7 @@ class Verdict:
 
     row: str | None
     seed: int
-    percent: int
+    percent: int | None  # the size of its dataset, where the recipe sweeps over sizes
     text: str
     lines: list[tuple[str, str]]
     remarks: list[str]
@@ -38,29 +40,79 @@ class Verdict:
         """Return the command that deploys the policy of the run at `run`; None where none is to be."""
         if self.row is None:
             return None
-        size = "" if self.percent == WHOLE else f" --percent {self.percent}"
+        size = "" if self.percent is None else f" --percent {self.percent}"
         out = f"{Path(run).name}_{self.row}"
         return f"astra-data deploy {run} --row {self.row} --seed {self.seed}{size} --out {out}"
 
 
+@dataclass(frozen=True)
+class _Basis:
+    """What methods are compared by: row → seed → value, what it is called, and its `limit` and `trials`."""
+
+    scores: Mapping[str, Mapping[int, float]]
+    title: str
+    where: str
+    digits: int
+    bounds: Mapping[str, Any]
+
+    def worth(self, row: str) -> Estimate:
+        """Return the mean over all seeds of a method."""
+        return summarize([*self.scores[row].values()], **self.bounds)
+
+    def text(self, row: str) -> str:
+        """Return that mean, in words."""
+        found = self.worth(row)
+        of = f"({found.seeds} seed{'s' if found.seeds > 1 else ''})"
+        return " ".join(filter(None, (self.title, interval(found, self.digits), self.where, of)))
+
+    def pair(self, row: str, other: str) -> tuple[list[int], list[float]]:
+        """Return the seeds that both have, and the mean of each on these, or on all of its own where there are none."""
+        shared = [seed for seed in self.scores[row] if seed in self.scores[other]]
+        return shared, [fmean(of[seed] for seed in shared or of) for of in (self.scores[row], self.scores[other])]
+
+    def leads(self, row: str, other: str) -> bool:
+        """Return whether the mean of a method is the higher one."""
+        _, (mean, its) = self.pair(row, other)
+        return mean > its
+
+    def best(self, rows: Sequence[str]) -> str | None:
+        """Return the one of `rows` that no other leads."""
+        best: str | None = None
+        for row in sorted(rows, key=lambda row: self.worth(row).value, reverse=True):
+            best = row if best is None or self.leads(row, best) else best
+        return best
+
+
+def _basis(results: Results) -> _Basis:
+    """Return what methods are compared by: the score in the target, else the success that judges predict."""
+    choice = None if results.tested_in == "target" else results.choice()
+    if choice is None:
+        headline, rows = results.headline, results.tested(results.largest)
+        scores = {row: found for row in rows if (found := results.values(row, headline.measure))}
+        return _Basis(scores, headline.title, results.where, headline.digits, results.bounds(headline.measure))
+    predicted: dict[str, dict[int, float]] = {}
+    for one in choice.candidates:
+        predicted.setdefault(one.row, {})[one.seed] = one.predicted
+    return _Basis(predicted, "predicted success", "", 2, {"limit": 1.0, "trials": choice.judged.episodes})
+
+
 def verdict_of(results: Results) -> Verdict:
     """Return which method of results to deploy, at the largest size of the dataset."""
-    percent, in_target = results.largest, results.tested_in == "target"
-    worth = {row: found for row in results.tested() if (found := _worth(results, row))}
-    rivals = [row for row in results.contenders() if row in worth]
-    if not rivals:
+    percent, in_target = results.largest if results.sizes else None, results.tested_in == "target"
+    basis = _basis(results)
+    rivals = [row for row in results.contenders() if row in basis.scores]
+    best = basis.best(rivals)
+    if best is None:
         return Verdict(None, 0, percent, "No method to deploy: all of them are references (floor or ceiling).", [], [])
-    best = max(rivals, key=lambda row: worth[row].value)
-    floors = [row for row in worth if method_role(row) == "floor"]
-    floor = max(floors, key=lambda row: worth[row].value, default=None)
-    title, score = method_title(best), _text(results, worth[best])
-    lines = [("best", f"{title}: {score}"), ("interval", _difference(results, best, floor))]
+    floor = basis.best([row for row in basis.scores if method_role(row) == "floor"])
+    title, score = method_title(best), basis.text(best)
+    lines = [("best", f"{title}: {score}"), ("interval", _difference(basis, best, floor))]
     if floor:
         note = "what no correction of the simulator reaches"
-        lines.insert(1, ("floor", f"{method_title(floor)} ({note}): {_text(results, worth[floor])}"))
+        lines.insert(1, ("floor", f"{method_title(floor)} ({note}): {basis.text(floor)}"))
     limit = results.headline.limit
     least = -np.inf if limit is None else ENOUGH * limit
-    is_beaten = floor is not None and worth[floor].value >= worth[best].value
+    is_beaten = floor is not None and not basis.leads(best, floor)
     learned = {row: results.score_of(row, SIMULATED) for row in rivals}
     poor = {row: found.value for row, found in learned.items() if found and found.value < least}
     poor = dict(sorted(poor.items(), key=lambda item: item[0] not in results.compare))
@@ -68,7 +120,7 @@ def verdict_of(results: Results) -> Verdict:
     chosen, advice = None, "Deploy" if in_target else "Try first"
     first = floor if floor and is_beaten else best
     failed = results.summary(first, "failed") if in_target and limit is not None else None
-    if worth[first].value < least:
+    if basis.worth(first).value < least:
         text = "{} did not learn its own simulator ({})"
         why = [text.format(method_title(row), results.headline.text(found)) for row, found in poor.items()]
         if not why:
@@ -79,36 +131,17 @@ def verdict_of(results: Results) -> Verdict:
     else:
         chosen, why_it = first, ", the floor: no method does better" if is_beaten else f": {score}"
         text = f"{advice} **{method_title(first)}**{why_it}."
-    return Verdict(
-        chosen, _seed(results, chosen) if chosen else 0, percent, text, lines, [*causes, *_limits(results, best)]
-    )
+    remarks = [*causes, *_limits(results, basis, best)]
+    return Verdict(chosen, _seed(results, chosen) if chosen else 0, percent, text, lines, remarks)
 
 
-def _worth(results: Results, row: str) -> Estimate | None:
-    """Return by what methods are compared: the score in the target, else the success that judges predict."""
-    judged = results.judged
-    if results.tested_in == "target" or not judged:
-        return results.score_of(row)
-    found = [np.mean([*one.success.values()]) for one in judged.candidates if one.row == row]
-    return summarize(np.array(found), limit=1.0, trials=judged.episodes) if found else None
-
-
-def _text(results: Results, found: Estimate) -> str:
-    seeds = f"({found.seeds} seed{'s' if found.seeds > 1 else ''})"
-    if results.tested_in != "target" and results.judged:
-        return f"predicted success {interval(found)} {seeds}"
-    headline = results.headline
-    return f"{headline.title} {interval(found, headline.digits)} {results.where} {seeds}"
-
-
-def _difference(results: Results, best: str, floor: str | None) -> str:
+def _difference(basis: _Basis, best: str, floor: str | None) -> str:
     if floor is None:
         return "no floor to compare with: expected `direct_transfer` among the finished methods"
-    found = results.difference(best, floor)
+    found = paired_difference(basis.scores[best], basis.scores[floor], **basis.bounds)
     if found is None:
         return f"{method_title(best)} and {method_title(floor)} share no seed"
-    value = interval(found, results.headline.digits)
-    text = f"{method_title(best)} less {method_title(floor)}: {value}"
+    text = f"{method_title(best)} less {method_title(floor)}: {interval(found, basis.digits)}"
     if found.low is None or found.high is None:
         return f"{text}, of too few seeds for an interval: run {LEAST_SEEDS} or more"
     return f"{text}, 95 %" + (": these seeds do not show a difference" if found.low <= 0 <= found.high else "")
@@ -145,22 +178,34 @@ def _lost(results: Results, row: str) -> Iterator[str]:
             )
 
 
-def _limits(results: Results, best: str) -> Iterator[str]:
+def _limits(results: Results, basis: _Basis, best: str) -> Iterator[str]:
     """Yield what limits the comparison."""
-    worth, choice = results.score_of(best), results.choice()
+    choice, count = results.choice(), len(basis.scores[best])
     if results.trials and results.trials.choice:
         yield f"{results.trials.spent} trials in the target choose {results.trials.choice}."
-    if worth and worth.seeds < LEAST_SEEDS:
-        yield f"Intervals are not shown: they need {LEAST_SEEDS} seeds, {method_title(best)} has {worth.seeds}."
+    if count < LEAST_SEEDS:
+        yield f"Intervals are not shown: they need {LEAST_SEEDS} seeds, {method_title(best)} has {count}."
+    for row in basis.scores:
+        shared, means = basis.pair(best, row)
+        is_compared = row in results.contenders() or method_role(row) == "floor"
+        is_alike = basis.scores[row].keys() == basis.scores[best].keys()
+        is_plain = len(shared) >= LEAST_SEEDS and basis.worth(best).value >= basis.worth(row).value
+        if is_compared and not (is_alike or is_plain):
+            on = (
+                f"on seed{'s' * (len(shared) > 1)} {listed([*map(str, shared)])}"
+                if shared
+                else "on other seeds, as they share none"
+            )
+            values = " and ".join(f"{mean:.{basis.digits}f}" for mean in means)
+            more = "" if len(shared) >= LEAST_SEEDS else f"; run the missing ones, to share {LEAST_SEEDS} or more"
+            yield f"{method_title(best)} and {method_title(row)} are compared {on}: {values}{more}."
     if choice and results.tested_in == "target" and choice.best.row != best:
         yield (
             f"Without the target, the judges (simulators that did not train a policy) choose "
             f"{choice.best.name}, with a predicted success of {choice.best.predicted:.2f}."
         )
-    if results.judged and results.tested_in != "target":
-        known = {one.row for one in results.judged.candidates}
-        if unjudged := [method_title(row) for row in results.contenders() if row not in known]:
-            yield f"Not judged, so not compared: {', '.join(unjudged)}."
+    if unjudged := [method_title(row) for row in results.contenders() if row not in basis.scores]:
+        yield f"Not judged, so not compared: {', '.join(unjudged)}."
 
 
 def _seed(results: Results, row: str) -> int:

@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fake_runs import line, results
+from fake_runs import edit_json, line, results
 from fake_stages import FakeStages
 
 from astra_data.core.artifact import MANIFEST
 from astra_data.core.errors import AstraDataError, BadInputError, MissingStageError, RecipeError
 from astra_data.pipeline.experiment import load_experiment
+from astra_data.pipeline.plan import selected
 from astra_data.pipeline.run import check, check_device, make, run, run_stage
 from astra_data.reports.results import results_json
 from astra_data.worlds.task import Task
@@ -123,8 +124,27 @@ def test_damage_is_set_aside_and_made_again_with_what_was_made_from_it(
     ]
     assert (aside / TRAIN / "policy.safetensors").read_bytes() == b"" and stages.made == [TRAIN, EVALUATE, "report"]
     (folder / EVALUATE / "evaluation.json").unlink()
-    run(recipe, root=recipe.parent)
+    run(recipe, methods=["astra_plus"], root=recipe.parent, until="evaluate")
+    assert [line["method"] for line in lines(folder)] == ["astra_plus"]
+    run_stage(recipe, "evaluate", root=recipe.parent)
+    assert [line["method"] for line in lines(folder)] == ["astra", "astra_plus"]
     assert made_again(folder) == [f"1/{EVALUATE}", f"1/{TRAIN}", f"2/{EVALUATE}"]
+
+
+def test_what_was_made_of_a_policy_that_is_another_now_is_made_again_at_once(
+    recipe: Path, folder: Path, stages: FakeStages
+) -> None:
+    shutil.rmtree(folder / TRAIN)
+    manifest = folder / EVALUATE / MANIFEST
+    edit_json(manifest, made_from=json.loads(manifest.read_text())["made_from"] | {"policy": "the one that was there"})
+    run(recipe, root=recipe.parent)
+    assert stages.made == [TRAIN, "report", EVALUATE, "report"] and states(recipe) == {}
+
+
+def test_a_diagnosis_of_other_pairs_does_not_stay(recipe: Path, folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    (folder / "diagnosis.md").touch()
+    run(recipe, root=recipe.parent, until="pair")
+    assert "diagnosis.md is not written: " in caplog.text and not (folder / "diagnosis.md").exists()
 
 
 def test_altered_bytes_are_found_where_a_step_reads_them(recipe: Path, folder: Path, stages: FakeStages) -> None:
@@ -246,7 +266,8 @@ def test_a_task_is_walked_through_where_its_policies_are_trained(
     monkeypatch.setattr("astra_data.pipeline.run.check_task", walked_through)
     with pytest.raises(BadInputError, match="task antmaze-umaze: fault"):
         given = "cuda" if engine == "ray" else device
-        make(load_experiment(recipe, tmp_path), (), (), device=given, engine=engine)
+        experiment = load_experiment(recipe, tmp_path)
+        make(experiment, (), (), selected(experiment.recipe), device=given, engine=engine)
     assert told == [device]
 
 

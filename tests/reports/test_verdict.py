@@ -1,5 +1,5 @@
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 import fake_runs
@@ -59,6 +59,23 @@ def test_a_lucky_seed_or_two_are_not_compared_with_three() -> None:
     assert verdict_of(results(FLOOR | {"nas": GOOD, "compass": (1.0, 1.0)})).row == "nas"
     assert verdict_of(results(FLOOR | {"nas": GOOD[:2], "compass": (1.0,)})).row == "nas"
     assert verdict_of(results(FLOOR | {"nas": (*GOOD, 0.9), "compass": (1.0,) * 3})).row == "compass"
+
+
+def test_methods_are_compared_on_the_seeds_that_both_have() -> None:
+    lucky = [line("astra", seed, success=0.9) for seed in (0, 1, 2)]
+    nas = dict(enumerate((0.95, 0.95, 0.95, 0.2, 0.2, 0.2)))  # seeds 3 to 5 are hard
+
+    def among(*rows: str, seeds: Collection[int]) -> Verdict:
+        lines = [*lucky, *(line(row, seed, success=nas[seed]) for row in rows for seed in seeds)]
+        return verdict_of(fake_runs.results(*lines, episodes=120))
+
+    found = among("nas", seeds=nas)
+    assert found.row == "nas" and "NAS and ASTRA are compared on seeds 0, 1 and 2: 0.95 and 0.90." in found.remarks
+    assert among("direct_transfer", seeds=nas).row == "direct_transfer"
+    few, none = among("nas", seeds=(2, 3, 4)), among("direct_transfer", seeds=(3, 4, 5))
+    assert "NAS and ASTRA are compared on seed 2: 0.95 and 0.90; run the missing ones, to share 3" in words(few)
+    assert none.row == "astra" and "on other seeds, as they share none: 0.90 and 0.20; run the" in words(none)
+    assert "compared" not in words(among("nas", seeds=(0, 1, 2)))
 
 
 def test_a_method_that_did_not_learn_its_own_simulator_is_the_reason_to_deploy_none() -> None:
@@ -151,14 +168,21 @@ def test_judges_choose_the_seed_and_without_a_target_the_method() -> None:
     assert "choose NAS, seed 0, with a predicted success of 0.90" in words(found)
     found = verdict_of(results(of, judged=judged, tested_in="simulators"))
     assert (found.row, found.seed) == ("nas", 0) and "predicted success 0.90" in found.text
+    floor = dict.fromkeys((7, 8, 9), 0.2)
+    both = [candidates[2], Candidate(row="direct_transfer", seed=0, success=floor)]
+    other = [one.model_copy(update={"percent": 20, "success": dict.fromkeys((7, 8, 9), 0.1)}) for one in both]
+    sized = judged.model_copy(update={"candidates": [one.model_copy(update={"percent": 100}) for one in both] + other})
+    found = verdict_of(results(of | {"direct_transfer": (0.6,)}, judged=sized, tested_in="simulators"))
+    assert dict(found.lines)["best"] == "NAS: predicted success 0.90 (1 seed)"  # of the largest size alone
+    assert "NAS less Direct transfer: 0.70" in dict(found.lines)["interval"] and "Not judged" in words(found)
 
 
-@pytest.mark.parametrize("percent", [100, 20])
-def test_the_command_is_one_that_the_command_line_takes(percent: int, tmp_path: Path) -> None:
-    base = results({"astra": GOOD})
+@pytest.mark.parametrize(("percent", "sizes"), [(100, []), (100, [20, 100]), (20, [20])])
+def test_the_command_is_one_that_the_command_line_takes(percent: int, sizes: list[int], tmp_path: Path) -> None:
+    base = results({"astra": GOOD}, settings={"sweep": {"percent": sizes}})
     lines = [line.model_copy(update={"percent": percent}) for line in base.lines]
     command = verdict_of(base.model_copy(update={"lines": lines})).command(tmp_path / "cart")
-    assert command is not None and ("--percent 20" in command) == (percent == 20)
+    assert command is not None and (f"--percent {percent} " in command) == bool(sizes)
     done = CliRunner().invoke(app, command.split()[1:])
     # It is understood; there is no such run.
     assert done.exit_code == 1 and "No such option" not in done.output

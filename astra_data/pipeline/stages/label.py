@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from astra_data.core.arrays import as_column, as_rows
-from astra_data.core.durable import make_folder, refuse_existing
+from astra_data.core.durable import folder_for, held, make_folder, refuse_existing
 from astra_data.core.errors import BadInputError
 from astra_data.core.lazy import Tensor, torch
 from astra_data.core.progress import Progress, silent
@@ -50,7 +50,7 @@ def label(
         >>> from astra_data import label
         >>> labeled = label("antmaze-umaze", data="walks", out=Path("labeled"))  # lacks nothing: a link
     """
-    world, source = task_named(task), opened(data)
+    world, source = task_named(task), _opened(data, out)
     check_fits(source, world)
     more = [one for one in (world.goal, *names.OUTCOME_COLUMNS) if one and one.name not in source.features]
     for warning in remarks(source, world):
@@ -88,6 +88,14 @@ def label(
         advice = f"also import {names.SUCCESS} if they ended on arrival"
         _log.warning("%s", f"{source.reference}: {fault} does not say why: {advice}")
     return writer.root
+
+
+def _opened(data: str | Path, out: Path | None) -> Dataset:
+    """Open the data, or pull them; of seeds that are labeled at once, one does while the others wait."""
+    if out is None:
+        return opened(data)
+    with folder_for(out), held(out.parent, wait=True):
+        return opened(data)
 
 
 def remarks(source: Dataset, task: Task) -> list[str]:

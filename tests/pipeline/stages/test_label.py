@@ -8,6 +8,7 @@ import pytest
 import torch
 from small_cart import Last, Reach
 
+from astra_data.core.durable import held
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import (
     ACTION,
@@ -26,7 +27,7 @@ from astra_data.dataset.columns import (
 )
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.writer import DatasetWriter
-from astra_data.io.hub.sharing import push
+from astra_data.io.hub.sharing import opened, push
 from astra_data.pipeline.stages.label import check_fits, label, remarks, with_outcomes
 from astra_data.robots.registry import task_named
 
@@ -245,5 +246,12 @@ def test_what_lacks_nothing_is_linked_and_what_lies_elsewhere_is_pulled(
         with pytest.raises(BadInputError, match="exists already; delete it or choose another folder"):
             label(CART, data=labeled, out=taken)
     address = push(str(labeled), f"file://{tmp_path}/shared")
+
+    def opened_alone(data: str) -> Dataset:
+        with held(tmp_path / "run") as is_free:  # another seed would pull to the same place
+            assert not is_free
+        return opened(data)
+
+    monkeypatch.setattr("astra_data.pipeline.stages.label.opened", opened_alone)
     pulled = label(CART, data=address, out=tmp_path / "run" / "seed_1")
     assert pulled.resolve() == home / "logs" / "data-2.0.0"
