@@ -55,7 +55,7 @@ def check(
     faults: list[str] = []
     for name in recipes:
         try:
-            if ":" in name or not (Path(name).suffix or Path(name).exists()):
+            if ":" in name or Path(name).suffix == ".py" or not (Path(name).suffix or Path(name).exists()):
                 _check_task(name)
             else:
                 faults += _check_recipe(Path(name), root, verify)
@@ -282,6 +282,8 @@ def view(
     from astra_data.pipeline.run_view import view_run
 
     view_run(run, uids or (), seed=seed, save=save)
+    if save:
+        typer.echo(f"written: {save}")
 
 
 @arguments.with_settings("astra_data.pipeline.stages.collect:CollectConfig")

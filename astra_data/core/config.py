@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, Tag, TypeAdapter, ValidationE
 from pydantic_core import ErrorDetails
 
 from astra_data.core.errors import BadInputError, RecipeError
-from astra_data.core.naming import shortened
+from astra_data.core.naming import first_few, shortened
 
 Count = Annotated[int, Field(ge=1, le=10**12)]
 AtOnce = Annotated[int, Field(ge=1, le=10**6)]  # a number of things that are in memory at the same time
@@ -24,6 +24,7 @@ Share = Annotated[float, Field(ge=0, le=1)]
 
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 
+MOST_KNOWN = 30  # names that an error lists
 _UNNAMED = ""
 _MOST_FAULTS = 5  # of a file that no user writes by hand
 _MOST_PARTS = 64  # of a key in TOML, between dots
@@ -156,11 +157,11 @@ def read_written[T](kind: type[T], path: Path, *, by: str, advice: str) -> T:
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """Return a clause that names the closest of `known`, or lists them all when none is close."""
+    """Return a clause that names the closest of `known`, or lists the first `MOST_KNOWN` when none is close."""
     known = list(known)
     if close := get_close_matches(name, known, n=1):
         return f": did you mean '{close[0]}'?"
-    return f"; known: {', '.join(known)}" if known else ""
+    return f"; known: {first_few(known, MOST_KNOWN)}" if known else ""
 
 
 def _fault(error: ErrorDetails, model: type[BaseModel]) -> str:

@@ -17,6 +17,7 @@ from astra_data.dataset.reader import Dataset
 
 SHOWN = 5  # episodes that a line names; further ones are counted
 ANGLE = re.compile(r"(.+_)?(heading|yaw|theta|psi|roll|pitch|angle|q\d*|joint\d*)")  # names of angles
+QUATERNION = re.compile(r"(.+_)?(q|quat(ernion)?|orient(ation)?|rot(ation)?)_?")  # what comes before its x, y, z, w
 TURNS = {"rad": 2 * math.pi, "deg": 360.0}  # what a full turn is in each unit
 LARGEST = 4 * math.pi  # few robots turn further than twice around
 
@@ -51,15 +52,31 @@ def channels(column: Column, indices: Sequence[int]) -> str:
 
 def is_angle(name: str) -> bool:
     """Return whether `name` is one of an angle, as "base.theta" or "Yaw.pos"."""
-    short = re.sub(r"[^a-z0-9]+", "_", name.lower())
-    return ANGLE.fullmatch(re.sub(r"_(pos|position|rad|deg)$", "", short)) is not None
+    return ANGLE.fullmatch(re.sub(r"_(pos|position|rad|deg)$", "", _plain(name))) is not None
 
 
-def full_turns(column: Column) -> Floats:
-    """Return what a full turn adds to each value of a column, (size,); 0 for values that are no angles."""
-    roles = (column.astra or {}).get("role", [""] * column.size)
-    radians = [2 * np.pi if role == "heading" else 0.0 for role in roles]
-    return np.array([TURNS.get(unit, turn) for unit, turn in zip(column.units, radians, strict=True)])
+def _plain(name: str) -> str:
+    return re.sub(r"[^a-z0-9]+", "_", name.lower())
+
+
+def quaternions(column: Column) -> list[list[int]]:
+    """Return the indices of each quaternion of a column, by its roles or else its names; some have z and w alone."""
+    at, indices = {_plain(label): index for index, label in enumerate(column.labels)}, [*range(column.size)]
+    stems = [label[:-1] for label in at if label.endswith("w") and QUATERNION.fullmatch(label[:-1])]
+    named = [[at[f"{stem}{end}"] for end in "xyzw" if f"{stem}{end}" in at] for stem in stems]
+    return [indices[part] for role, part in column.roles if role == "quaternion"] or [p for p in named if len(p) > 1]
+
+
+def full_turns(column: Column, farthest: Floats | None = None) -> Floats:
+    """Return what a full turn adds to each value of a column, (size,); 0 for values that are no angles.
+
+    These have a unit or role that says so; with `farthest`, how far each is from 0, or no unit and an angle's name.
+    """
+    named = [2 * np.pi * (role == "heading") for role in (column.astra or {}).get("role", [""] * column.size)]
+    for index, far in enumerate([] if farthest is None else farthest):
+        if column.units[index] in ("", "1") and is_angle(column.labels[index]):
+            named[index] = TURNS["rad" if far <= LARGEST else "deg"]
+    return np.array([TURNS.get(unit, turn) for unit, turn in zip(column.units, named, strict=True)])
 
 
 def shortest(steps: Floats, turns: Floats) -> Floats:

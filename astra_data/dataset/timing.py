@@ -15,7 +15,7 @@ from astra_data.core.config import did_you_mean
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import first_few
 from astra_data.dataset import columns as names
-from astra_data.dataset.checkup import SHOWN, TURNS, is_clock
+from astra_data.dataset.checkup import SHOWN, full_turns, is_clock, quaternions
 from astra_data.dataset.columns import Array, Column, Episode, new_uid
 from astra_data.dataset.inspection import outcome_of
 from astra_data.dataset.reader import Dataset
@@ -83,7 +83,7 @@ def trim(
 def resample(source: Dataset, fps: int, *, name: str | None = None, out: Path | None = None) -> Path:
     """Write `source` at another rate: commands are held, states interpolated, rewards summed, times true.
 
-    Angles (unit rad or deg) within a turn are interpolated the shorter way, quaternions as such. Columns of a
+    Angles within a turn, by unit, role or name, are interpolated the shorter way, quaternions as such. Columns of a
     pairing are left out, since steps of another length land elsewhere: pair it again. What is left of an episode
     after its last whole step adds its reward and ending to that step; one shorter than a step is left out.
     """
@@ -209,12 +209,11 @@ def _resampled(episode: Episode, turns: Sequence[tuple[Column, _Turns]], before:
 
 def _turns(column: Column, source: Dataset) -> _Turns:
     """Return the full turns of the angles in a column by index; those that range over more are counted, and go on."""
-    angles = {index: TURNS[unit] for index, unit in enumerate(column.units) if unit in TURNS}
-    if not angles:  # of a recording, statistics take a reading of all values
-        return angles
-    found = source.statistics()[column.name]
-    ranges = np.ravel(found["max"]) - np.ravel(found["min"])
-    return {index: turn for index, turn in angles.items() if ranges[index] <= 1.001 * turn}
+    if not full_turns(column, np.zeros(column.size)).any():  # of a recording, statistics take a reading of all values
+        return {}
+    least, most = (np.ravel(source.statistics()[column.name][key]) for key in ("min", "max"))
+    turns = full_turns(column, np.maximum(-least, most)).tolist()
+    return {index: turn for index, turn in enumerate(turns) if 0 < most[index] - least[index] <= 1.001 * turn}
 
 
 def _interpolated(values: Floats, at: Floats, column: Column, turns: _Turns) -> Floats:
@@ -229,12 +228,12 @@ def _interpolated(values: Floats, at: Floats, column: Column, turns: _Turns) -> 
     share[share < 1e-6] = 0.0
     first, second = values[low], values[high]
     found = (1 - share) * first + share * second
-    for role, part in column.roles:
-        if role == "quaternion":
-            sign = np.where((first[:, part] * second[:, part]).sum(axis=1, keepdims=True) < 0, -1.0, 1.0)
-            turned = (1 - share) * first[:, part] + sign * share * second[:, part]
-            norm = np.linalg.norm(turned, axis=1, keepdims=True)
-            found[:, part] = turned / np.where(norm > 0.0, norm, 1.0)
+    for part in quaternions(column):  # q and -q are one rotation
+        ends = first[:, part], second[:, part]
+        sign = np.where((ends[0] * ends[1]).sum(axis=1, keepdims=True) < 0, -1.0, 1.0)
+        turned = (1 - share) * ends[0] + sign * share * ends[1]
+        lengths = [np.linalg.norm(one, axis=1, keepdims=True) for one in (*ends, turned)]
+        found[:, part] = turned * ((1 - share) * lengths[0] + share * lengths[1]) / np.maximum(lengths[2], 1e-9)
     found = np.where(share == 0.0, first, found)
     for index, turn in turns.items():
         if (values[:, index] != recorded[:, index]).any():  # wrapped angles stay so

@@ -61,7 +61,7 @@ _UNITS = {
     "rad/s²": f"deg_s2 {_DEGREE} rad_s2 1",
     "m": "mm 1e-3 cm 1e-2 km 1e3 m 1",
     "rad": f"deg {_DEGREE} degrees {_DEGREE} rad 1",
-} | {"N m": "nm 1", "N": "n 1", "V": "v 1", "A": "a 1"}
+} | {"N m": "nm 1", "N": "n 1", "V": "v 1", "A": "a 1", "1": "pct 1e-2 percent 1e-2"}
 UNITS = {end: (unit, float(scale)) for unit, ends in _UNITS.items() for end, scale in batched(ends.split(), 2)}
 """Endings of names, the unit that values are stored in, and the factor to it."""
 TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
@@ -378,8 +378,8 @@ def csv_files(place: Path) -> list[Path]:
 
 
 def plain_name(name: str) -> str:
-    """Return a field's name in small letters, digits and single underscores; ° is deg, ² and ^2 are 2."""
-    spelled = re.sub(r"(?<=[a-z]{2})(?=[A-Z])", "_", name).lower().replace("°", " deg ")
+    """Return a field's name in small letters, digits and single underscores; ° is deg, % pct, ² and ^2 are 2."""
+    spelled = re.sub(r"(?<=[a-z]{2})(?=[A-Z])", "_", name).lower().replace("°", " deg ").replace("%", " pct ")
     return re.sub(r"[^a-z0-9]+", "_", spelled.replace("²", "2").replace("^", "")).strip("_")
 
 

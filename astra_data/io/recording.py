@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePath, PurePosixPath
 from typing import IO, cast
 
-from astra_data.core.config import did_you_mean
+from astra_data.core.config import MOST_KNOWN, did_you_mean
 from astra_data.core.durable import file_digest, files_below
 from astra_data.core.errors import BadInputError, in_short
 from astra_data.core.naming import first_few
@@ -301,12 +301,12 @@ def _members(archive: Path) -> list[tarfile.TarInfo]:
 
 def row_count(origin: str, fields: Sequence[str], shapes: Mapping[str, tuple[int, ...]]) -> int:
     """Return how many rows `fields` have, of the `shapes` of every field in the file `origin`."""
-    unused, known = [name for name in shapes if name not in fields], f"; known: {', '.join(shapes)}"
-    hints = {field: did_you_mean(field, unused) or known for field in fields if field not in shapes}
-    if len(hints) > 1 and len(set(hints.values())) == 1:  # all are listed, once
-        faults = [f"no fields {', '.join(map(repr, hints))}{next(iter(hints.values()))}"]
-    else:
-        faults = [f"no field '{field}'{hint}" for field, hint in hints.items()]
+    unused = [name for name in shapes if name not in fields]
+    hints = {field: did_you_mean(field, unused) for field in fields if field not in shapes}
+    faults = [f"no field '{field}'{hint}" for field, hint in hints.items() if hint.startswith(":")]
+    if lost := [repr(field) for field, hint in hints.items() if not hint.startswith(":")]:
+        some = "s" * (len(lost) > 1)
+        faults.append(f"no field{some} {', '.join(lost)}; known: {first_few(list(shapes), MOST_KNOWN)}")
     found = {field: shapes[field] for field in fields if field in shapes}
     faults += [f"field '{field}' is a single value, expected rows" for field in found if not found[field]]
     lengths = {field: shape[0] for field, shape in found.items() if shape}

@@ -16,6 +16,7 @@ import numpy as np
 from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError
 from astra_data.core.lazy import torch
+from astra_data.dataset.checkup import QUATERNION
 from astra_data.dataset.columns import Column
 from astra_data.io.guessing import HEADING, PLACE, TURNED, Field, Logs
 
@@ -32,7 +33,6 @@ STEERING = re.compile(r"(.+_)?steer(ing)?(_?(angle|ang))?")
 SIDE = re.compile(r"(left|port|(?<![a-z])[vw]?l(?![a-z]))|right|starboard|(?<![a-z])[vw]?r(?![a-z])")
 AHEAD = re.compile(r"v|(.+_)?(speed|vel(ocity)?|throttle|forward|surge|(linear|v)(_?x)?)(_.+)?")
 SIDEWAYS = re.compile(r"(.+_)?(sway(_.+)?|(v|vel|velocity|linear)_?y)")
-QUATERNION = re.compile(r"(.+_)?(q|quat(ernion)?|orient(ation)?|rot(ation)?)_?")
 HEADINGS: tuple[tuple[re.Pattern[str], Sequence[str], str, str], ...] = (
     (HEADING, ("_x", "_y"), "{0}", "{1}"),
     (HEADING, ("",), "of.cos({0})", "of.sin({0})"),

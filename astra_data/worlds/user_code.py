@@ -310,6 +310,7 @@ def judged(objective: Objective, name: str, state: Tensor, goal: Tensor) -> Tens
     return expect(what, found, (len(state),), torch.bool, state.device)
 
 
+@without_gradients
 def paid(objective: Objective, before: Tensor, after: Tensor, goal: Tensor, failed: Tensor) -> Tensor:
     """Return the rewards (B,) of steps between states (B, X)."""
     what = "objective.reward(before, after, goal, failed)"

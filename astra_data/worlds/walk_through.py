@@ -65,14 +65,18 @@ def _rate(task: Task) -> None:
 
 def _drawn(task: Task, kind: str, size: int) -> Tensor:
     what = f"objective.draw_{kind}(rng, {_COUNT})"
-    found = answered(what, getattr(task.objective, f"draw_{kind}"), generator(0, kind), _COUNT)
+    draw = getattr(task.objective, f"draw_{kind}")
+    found, again = (answered(what, draw, generator(0, kind), _COUNT) for _ in range(2))
     if not isinstance(found, np.ndarray) or found.dtype.kind not in "biuf":
         got = f"one of {found.dtype}" if isinstance(found, np.ndarray) else f"a {type(found).__name__}"
         raise BadInputError(f"{what}: expected a NumPy array of numbers, got {got}")
-    if kind == "goals" and found.ndim == 2 and (drawn := found.shape[1]) != size:
-        advice = f"`goal_size = {drawn}` beside the objective's action_size" if drawn else "draw_goals"
+    if kind == "goals" and found.ndim == 2 and (wide := found.shape[1]) != size:
+        advice = f"`goal_size = {wide}` beside the objective's action_size" if wide else "draw_goals"
         raise BadInputError(f"{what}: expected shape ({_COUNT}, {size}), got {found.shape}: write {advice}")
-    return expect(what, torch.from_numpy(np.ascontiguousarray(found)), (_COUNT, size)).float()
+    drawn = expect(what, torch.from_numpy(np.ascontiguousarray(found)), (_COUNT, size)).float()
+    if not np.array_equal(found, again):
+        raise BadInputError(f"{what}: expected the same from an rng of the same seed, got others: draw with rng alone")
+    return drawn
 
 
 def _states(task: Task) -> Tensor:

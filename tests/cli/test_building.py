@@ -144,6 +144,7 @@ def test_a_task_is_walked_through(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     result = CliRunner().invoke(app, ["check", f"{CART}:TASK"])
     assert result.exit_code == 0 and "small_cart.py:TASK: found no errors" in result.output
     assert result.output.startswith("commands: v -1…4\nabstract states: x\n")
+    assert "name your own task like cart.py:TASK" in str(CliRunner().invoke(app, ["check", f"{CART}"]).exception)
     monkeypatch.chdir(tmp_path)
     shutil.copy(CART, tmp_path)  # a file of the user's imports those beside it
     (tmp_path / "wrong.py").write_text(WRONG)

@@ -1,5 +1,6 @@
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from astra_data.dataset.timing import resample, trim
 
 EPOCH_NS = 1_700_000_000_123_456_789
 TURNS = {"unit": ["m", "rad", "1", "1", "1", "1"], "role": ["invariant", "heading", *["quaternion"] * 4]}
+NAMED = ("x", "base.yaw", "quat_w", "quat_x", "quat_y", "quat_z")
 
 
 def made(path: Path) -> list[Episode]:
@@ -125,15 +127,19 @@ def test_what_cannot_be_trimmed_is_told_and_nothing_written(
     assert not (tmp_path / "out").exists()
 
 
-def turning(folder: Path, fps: int, steps: int) -> Dataset:
-    """A robot that moves by 2 m/s and turns by 3 rad/s, recorded `fps` times a second, commands by their number."""
+def turning(folder: Path, fps: int, steps: int, names: tuple[str, ...] = ()) -> Dataset:
+    """A robot that moves by 2 m/s and turns by 3 rad/s, recorded `fps` times a second, commands by their number.
+
+    What turns is known by roles, or by `names` alone.
+    """
+    known: dict[str, Any] = {"names": names} if names else {"astra": TURNS}
     time_s = np.arange(steps + 1) / fps
     yaw = 3 * time_s
     quaternion = np.stack([np.cos(yaw / 2), 0 * yaw, 0 * yaw, np.sin(yaw / 2)], 1)
     quaternion[::2] *= -1  # the same rotation
     state = np.concatenate([2 * time_s[:, None], ((yaw + np.pi) % (2 * np.pi) - np.pi)[:, None], quaternion], 1)
     last = np.arange(steps) == steps - 1
-    columns = [Column(STATE, size=6, astra=TURNS), Column(NEXT_STATE, size=6, astra=TURNS), Column(ACTION)]
+    columns = [Column(STATE, size=6, **known), Column(NEXT_STATE, size=6, **known), Column(ACTION)]
     columns += [Column(REWARD), Column(TERMINATED, "bool"), Column(SUCCESS, "bool"), Column("abstract.state")]
     columns += [
         Column("time"),
@@ -152,11 +158,12 @@ def turning(folder: Path, fps: int, steps: int) -> Dataset:
     return write_fake(folder, [episode], columns=columns, fps=fps)
 
 
+@pytest.mark.parametrize("names", [(), NAMED, (*NAMED[:2], "orientation_w", "a", "b", "orientation_z")])
 @pytest.mark.parametrize(("recorded", "fps", "steps"), [(62, 10, 12), (62, 25, 31), (62, 100, 124), (61, 100, 122)])
 def test_states_at_another_rate_are_where_the_robot_was(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, recorded: int, fps: int, steps: int
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, recorded: int, fps: int, steps: int, names: tuple[str, ...]
 ) -> None:
-    root = resample(turning(tmp_path / "logs", 50, recorded), fps, out=tmp_path / "out")
+    root = resample(turning(tmp_path / "logs", 50, recorded, names), fps, out=tmp_path / "out")
     found, (episode,) = Dataset.open(root), made(root)
     assert found.info["fps"] == fps and len(episode) == steps
     time_s = np.arange(len(episode)) / fps

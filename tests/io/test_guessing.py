@@ -81,6 +81,10 @@ ROLES: dict[str, tuple[dict[str, object], dict[str, str]]] = {
         {"compass": "state compass rad 0.01745", "cog": "state cog rad 1"}
         | {"Heading [°]": "state heading rad 0.01745"},
     ),
+    "percents": (
+        {"Motor [%]": RAMP, "throttle_pct": RAMP, "cmd_left_percent": RAMP},
+        {"Motor [%]": "state motor 1 0.01", "cmd_left_percent": "command left 1 0.01"},
+    ),
     "outcomes": (
         {"x": RAMP, "cmd": RAMP, "e_stop": LATE, "fell": LATE, "docked": LATE, "reward": RAMP},
         {"e_stop": "failure", "fell": "left out", "docked": "success", "reward": "reward"},

@@ -141,6 +141,9 @@ def test_a_field_that_is_read_already_is_not_proposed() -> None:
         row_count("a", ["q1_deg", "q2_deg"], shapes)
     with pytest.raises(BadInputError, match=r"^a: no field 'q3'; known: q1_deg, q2_rad, load$"):
         row_count("a", [*shapes, "q3"], shapes)
+    many = {f"run_{number}/load": (3,) for number in range(40)}
+    with pytest.raises(BadInputError, match=r"^a: no fields 'q', 'u'; known: run_0/load, .*, run_29/load and 10 more$"):
+        row_count("a", ["q", "u"], many)
 
 
 def test_files_are_named_by_their_paths_in_the_folder_that_holds_all_recordings(tmp_path: Path) -> None:

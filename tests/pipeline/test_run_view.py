@@ -100,7 +100,7 @@ def replayed(model: GroundingModel, start: torch.Tensor, commands: torch.Tensor)
 
 
 def test_held_out_episodes_are_shown_with_the_paths_of_all_simulators(run: Path, tmp_path: Path) -> None:
-    assert call("view", str(run), "--save", str(tmp_path / "run.rrd")).exit_code == 0
+    assert call("view", str(run), "--save", str(tmp_path / "run.rrd")).output == f"written: {tmp_path / 'run.rrd'}\n"
     recording = read(tmp_path / "run.rrd")
     # The error of the grounding is of the same episodes: a replay for every 25 steps begun.
     lengths = [len(commands) for uid, _, commands in recorded_steps(run) if uid in shown(recording)]

@@ -2,6 +2,7 @@ import hashlib
 import json
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -272,3 +273,9 @@ def test_answers_come_where_the_states_are() -> None:
     """Else they meet no other tensor of a training on a GPU; "meta" stands for one."""
     with pytest.raises(BadInputError, match=r"^pay: expected a tensor on meta, where its inputs are, got cpu$"):
         user_code.expect("pay", torch.zeros(3), (3,), device=torch.device("meta"))
+
+
+def test_rewards_of_a_network_record_no_gradients() -> None:
+    network, state = torch.nn.Linear(1, 1), torch.zeros(3, 1)
+    objective: Any = SimpleNamespace(reward=lambda before, after, goal, failed: network(after)[:, 0])
+    assert user_code.paid(objective, state, state, state, state[:, 0] > 0).numpy().shape == (3,)

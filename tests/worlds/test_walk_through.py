@@ -150,6 +150,10 @@ WRONG: list[tuple[Task, str]] = [
         "objective.draw_starts(rng, 3): expected a NumPy array of numbers, got a Tensor",
     ),
     (
+        objective(draw_starts=lambda self, rng, count: np.random.default_rng().uniform(size=(count, 1))),
+        "objective.draw_starts(rng, 3): expected the same from an rng of the same seed, got others",
+    ),
+    (
         replace(objective(draw_goals=lambda self, rng, count: np.array([["x"]] * count)), robot=None),
         "objective.draw_goals(rng, 3): expected a NumPy array of numbers, got one of <U1",
     ),

@@ -12,7 +12,7 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.lazy import torch
 from astra_data.core.progress import Progress, Stopwatch, silent
 from astra_data.dataset import columns as keys
-from astra_data.dataset.checkup import LARGEST, TURNS, is_angle
+from astra_data.dataset.checkup import TURNS, full_turns
 from astra_data.dataset.columns import Array, in_blocks
 from astra_data.dataset.compare import column_faults, names_apart
 from astra_data.dataset.reader import Dataset
@@ -102,12 +102,9 @@ def pair(
             rate = steps / stopwatch.seconds
             progress(steps / int(source.lengths.sum()), f"{rate:,.0f} pairs/s")
         writer.made = {"reset_error": reset_error, **stopwatch.spent()}
-    units = list(pairing.abstract_state.units)
-    for entry, unit in enumerate(units):
-        if unit in ("", "1") and is_angle(_name(pairing, entry)):
-            units[entry] = "rad" if farthest[entry] <= LARGEST else "deg"
+    turns = full_turns(pairing.abstract_state, farthest)
     for unit, half in (("rad", "π"), ("deg", "180°")):
-        jumped = [entry for entry, rows in enumerate(jumps[unit]) if rows and units[entry] == unit]
+        jumped = [entry for entry, rows in enumerate(jumps[unit]) if rows and turns[entry] == TURNS[unit]]
         if wrapped := [f"{_name(pairing, entry)} in {jumps[unit][entry]} of {steps} rows" for entry in jumped]:
             _log.warning(
                 f"{pairing.id} lands more than {half} from where the robot was: {', '.join(wrapped)}; "
