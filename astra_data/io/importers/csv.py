@@ -25,6 +25,7 @@ _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?|[+-]?(nan|inf)", re.IG
 _MARKS = {";": "semicolons", "\t": "tabs", ",": "commas"}
 _LIST = re.compile(r"\s*[\[(](.*)[\])]\s*", re.DOTALL)
 _SAVE = "save it as UTF-8"
+_HELD = 5  # periods of a joined file for which its last row may be held without a note
 _SHOWN = 80  # characters of a line above the header that are shown
 
 
@@ -136,23 +137,29 @@ def _joined(source: Source, mapping: ImportMapping) -> Iterator[Block]:
         }
     values = tables[main]
     now = values[time]
-    is_known = np.ones(len(now), bool)
+    is_known, notes = np.ones(len(now), bool), list[str]()
     for name in rest:
         times = tables[name].pop(time)
         if not (np.diff(times) >= 0).all():
             raise BadInputError(f"{source.parts[name]}: '{time}' goes back or is missing: sort its rows by it")
         last = np.searchsorted(times, now, side="right") - 1
         is_known &= last >= 0
-        gap = (mapping.split.gap_s or np.inf) / mapping.time_scale
+        held = now[is_known] - times[last[is_known]]
+        usual, longest = np.median(np.diff(times)) if len(times) > 1 else np.inf, np.nanmax(held, initial=0)
+        if mapping.split.gap_s is None and longest > _HELD * usual:
+            every_s, most_s = mapping.time_scale * usual, mapping.time_scale * longest
+            what = f"rows of {name}, which come every {every_s:.3g} s, hold for up to {most_s:.3g} s"
+            notes.append(f"{what}: set split.gap_s, or compare the clocks of the files")
         # Rows without a time are refused, or left out, as those of a single file.
-        is_known[is_known] &= ~(now[is_known] - times[last[is_known]] > gap)
+        is_known[is_known] &= ~(held > (mapping.split.gap_s or np.inf) / mapping.time_scale)
         values |= {field: column[last] for field, column in tables[name].items() if len(times)}
     kept = np.flatnonzero(is_known)
     if len(now) and not len(kept):
-        raise BadInputError(f"{source}: no row has rows of {', '.join(rest)} before it that are recent enough")
+        advice = "compare the clocks of the files, or raise split.gap_s"
+        raise BadInputError(f"{source}: no row has a recent enough one of {', '.join(rest)} before it: {advice}")
     begins = np.flatnonzero(np.diff(kept, prepend=-2) > 1).tolist()
     lost = f"left out {len(now) - len(kept)} rows without recent enough ones of {', '.join(rest)}"
-    notes = [f"left out the last line of {name}, which is cut off" for name in torn if name != main]
+    notes += [f"left out the last line of {name}, which is cut off" for name in torn if name != main]
     notes += [lost] if len(kept) < len(now) else []
 
     def line(row: int) -> int:

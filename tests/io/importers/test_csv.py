@@ -166,6 +166,8 @@ def test_files_of_one_recording_are_joined_by_time(tmp_path: Path) -> None:
     lost = "left out {} rows without recent enough ones of control_state.csv"
     assert all(lost.format(rows) in str(report) for rows in (3, 6))
     assert "left out the last line of control_state.csv, which is cut off" in str(report)
+    _, report = imported(tmp_path / "held", tmp_path / "logs", JOINED.replace("gap_s = 0.15\n", ""))
+    assert "rows of control_state.csv, which come every 0.05 s, hold for up to 0.45 s: set split.gap_s" in str(report)
     (state := tmp_path / "logs/run1_state.csv").write_text(state.read_text().replace("\n900,", "\n,"))
     with pytest.raises(BadInputError, match=r"t in 1 row, run1_state\.csv line 11"):
         imported(tmp_path / "again", tmp_path / "logs", JOINED)
