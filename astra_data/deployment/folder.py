@@ -32,9 +32,7 @@ def page(about: Mapping[str, Any]) -> str:
     values |= {"stop": None if is_position else [0.0] * len(about["command"]["names"])}
     for name in ("state", "goal", "command"):
         lists = {key: entries for key, entries in about[name].items() if not isinstance(entries, str)}
-        titles = [
-            {"names": "name", "units": "unit", "frames": "frame"}.get(key, key.replace("_", " ")) for key in lists
-        ]
+        titles = [key.removesuffix("s").replace("_", " ") for key in lists]
         rows = zip(*lists.values(), strict=True)
         cells = [[f"{value:.4g}" if isinstance(value, float) else str(value) for value in row] for row in rows]
         shown = table(titles, cells, words=len(titles)) if lists["names"] else "None: all episodes have the same."

@@ -17,7 +17,7 @@ import numpy as np
 
 from astra_data.core.artifact import MANIFEST, read_manifest
 from astra_data.core.config import Config, did_you_mean, read_written, validated
-from astra_data.core.durable import begun_beside, write_file
+from astra_data.core.durable import begun_beside
 from astra_data.core.errors import AstraDataError, BadInputError, RecipeError
 from astra_data.core.naming import first_few, shortened, stage_of_key
 from astra_data.dataset.columns import ABSTRACT_STATE, ACTION
@@ -102,13 +102,6 @@ class Experiment:
                 raise RecipeError(f"{link} is in the way: {uses}; give the recipe another name, or remove {link}")
             if stage in self.borrowed:
                 link.symlink_to(Path("..") / source / stage)
-
-    def write_made_with(self, items: Collection[Item]) -> None:
-        """Write down what `items` are made with, before they are begun."""
-        for item in items:
-            if item.stage not in ALWAYS_NEW:
-                file = self.folder / MADE_WITH / f"{item.key}.json"
-                write_file(file, json.dumps(item.settings, indent=1) + "\n")
 
     @cached_property
     def _outdated(self) -> dict[str, str]:

@@ -205,10 +205,11 @@ class Recipe(Config):
         collects_by = self.collect and self.collect.behavior
         if collects_by == "suboptimal_sac" and not task_named(self.task).objective.is_lasting:
             raise ValueError(f"collect: good episodes of {self.task} are short: use 'suboptimal_ppo'")
-        if self.augment and self.sweep.percent:
-            raise ValueError(
-                "sweep.percent: counts recorded episodes, but [augment] adds copies of these: leave out one of the two"
-            )
+        uncounted = "[augment] adds copies of these" if self.augment else ""
+        if self.collect and self.collect.least_steps:
+            uncounted = "collect.least_steps may record fewer"
+        if uncounted and self.sweep.percent:
+            raise ValueError(f"sweep.percent: counts recorded episodes, but {uncounted}: leave out one of the two")
         for name, values in {"methods": self.methods, "seeds": self.seeds, "sweep.percent": self.sweep.percent}.items():
             if len(set(values)) < len(values):
                 raise ValueError(f"expected each of {name} once, got {list(values)}")

@@ -5,6 +5,7 @@ import json
 import logging
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from io import StringIO
 from itertools import count
@@ -48,10 +49,6 @@ SET_ASIDE = "set_aside"  # the folder of a run for artifacts that are made again
 POINTS = "sweep.csv"
 TIMED = {"ground": METRICS, "train": CURVE, "align": METRICS, "evaluate": EVALUATION}
 """Stages that are run for few points at once, and the file with the time that they took."""
-COLUMNS = (
-    *("method", "percent", "seed", "success", "steps", "return", "failed", "simulated_success"),
-    *("dataset_version", "dataset_hash", "commit", "wall_seconds"),
-)
 
 _log = logging.getLogger(__name__)
 
@@ -108,14 +105,9 @@ def run(
 def write_errors(experiment: Experiment, part: Selection) -> Path | None:
     """Write the page of held-out errors of the groundings that `part` needs; return it, None if none."""
     rows = [*part.methods, reference_of(experiment.recipe.methods)]
-    return write_held_out(
-        experiment.path.stem,
-        experiment.folder,
-        tuple(dict.fromkeys(grounded_as(row) for row in rows if row and method_named(row).grounds)),
-        part.seeds,
-        part.percents,
-        timestep_s=task_named(experiment.recipe.task).timestep_s,
-    )
+    groundings = dict.fromkeys(grounded_as(row) for row in rows if row and method_named(row).grounds)
+    of, timestep_s = replace(part, methods=tuple(groundings)), task_named(experiment.recipe.task).timestep_s
+    return write_held_out(experiment.path.stem, experiment.folder, of, timestep_s=timestep_s)
 
 
 def write_diagnosis(experiment: Experiment, part: Selection) -> None:
@@ -244,8 +236,11 @@ def make(
         write_file(folder / RECORD, recipe.model_dump_json(indent=2) + "\n")
         if digests := digests_of(recipe.task, recipe.user_methods):
             write_file(folder / CODE, json.dumps(recorded_code(folder) | digests, indent=1) + "\n")
-        experiment.write_made_with(items)
-        _write_points(experiment)
+        for item in items:
+            if item.stage not in ALWAYS_NEW:
+                write_file(folder / MADE_WITH / f"{item.key}.json", json.dumps(item.settings, indent=1) + "\n")
+        if any(item.stage in ("evaluate", "report") for item in asked):
+            _write_points(experiment)
 
         def finished(key: str) -> None:
             if key in points:
@@ -324,7 +319,7 @@ def _write_points(experiment: Experiment) -> dict[str, dict[str, Any]]:
     }
     if lines:
         text = StringIO()
-        writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
+        writer = csv.DictWriter(text, [*next(iter(lines.values()))], lineterminator="\n")
         writer.writeheader()
         writer.writerows(lines.values())
         write_file(experiment.folder / POINTS, text.getvalue())

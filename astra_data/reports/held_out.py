@@ -11,7 +11,7 @@ from astra_data.core.durable import write_file
 from astra_data.methods import method_title
 from astra_data.reports.blocks import Block, Section, TableBlock, Text, markdown
 from astra_data.reports.results import Results, all_bins, judged_horizon
-from astra_data.reports.runs import Owner, RunReader
+from astra_data.reports.runs import Owner, RunReader, Selection
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -24,23 +24,15 @@ _FITS = {"r2_state": "state", "r2_reward": "reward of steps that go on", "r2_lat
 """R² of a grounding's heads, and their titles."""
 
 
-def write_held_out(
-    recipe: str,
-    root: Path,
-    groundings: Sequence[str],
-    seeds: Sequence[int],
-    percents: Sequence[int],
-    *,
-    timestep_s: float,
-) -> Path | None:
-    """Write the page of all finished groundings to `root`, and a figure if they predict failures; None without one."""
+def write_held_out(recipe: str, root: Path, of: Selection, *, timestep_s: float) -> Path | None:
+    """Write the page of the finished groundings of a selection, and a figure if they predict failures; None of none."""
     run = RunReader(root)
-    for row, percent, seed in product(groundings, sorted(percents) or (None,), sorted(seeds)):
+    for row, percent, seed in product(of.methods, sorted(of.percents) or (None,), sorted(of.seeds)):
         run.grounding(Owner(row, seed, percent))
     if not run.errors:
         return None
     parts: dict[str, Any] = {"timestep_s": timestep_s, "lines": run.lines, "errors": run.errors}
-    results = Results(recipe=recipe, task="", command="", rows=tuple(groundings), episodes=0, **parts)
+    results = Results(recipe=recipe, task="", command="", rows=of.methods, episodes=0, **parts)
     seeds_text = ", ".join(map(str, sorted({one.seed for one in results.errors})))
     blocks: list[Block] = [
         Text(

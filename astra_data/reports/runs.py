@@ -143,7 +143,8 @@ def read_run(
             curve = run.read("train", owner, artifacts.CURVE, artifacts.CurveFile)
             if curve and owner in finished:
                 steps = [point.steps for point in curve.points]
-                found = [point.success if scores[0] == SUCCESS else point.episode_steps for point in curve.points]
+                kept = {"success": "success", "steps": "episode_steps"}.get(scores[0].measure, "")
+                found = [getattr(point, kept, None) for point in curve.points]  # others are not kept
                 trainings.append(results.TrainingFacts.model_validate(owner.facts() | {"steps": steps, "score": found}))
         for owner in dict.fromkeys(owner._replace(row=grounded_as(owner.row)) for owner in finished):
             run.grounding(owner)

@@ -6,8 +6,9 @@ less than a third of them, and no floor does as well. Otherwise none is, for the
 the task in the simulator of its training; what was learned there is lost in the target; the best fails too often.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from operator import gt
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -16,6 +17,7 @@ import numpy as np
 
 from astra_data.methods import grounded_as, method_role, method_title
 from astra_data.reports.blocks import listed
+from astra_data.reports.choice import Choice
 from astra_data.reports.results import SIMULATED, Results, judged_horizon
 from astra_data.reports.statistics import LEAST_SEEDS, Estimate, interval, paired_difference, summarize
 
@@ -45,74 +47,23 @@ class Verdict:
         return f"astra-data deploy {run} --row {self.row} --seed {self.seed}{size} --out {out}"
 
 
-@dataclass(frozen=True)
-class _Basis:
-    """What methods are compared by: row → seed → value, what it is called, and its `limit` and `trials`."""
-
-    scores: Mapping[str, Mapping[int, float]]
-    title: str
-    where: str
-    digits: int
-    bounds: Mapping[str, Any]
-
-    def worth(self, row: str) -> Estimate:
-        """Return the mean over all seeds of a method."""
-        return summarize([*self.scores[row].values()], **self.bounds)
-
-    def text(self, row: str) -> str:
-        """Return that mean, in words."""
-        found = self.worth(row)
-        of = f"({found.seeds} seed{'s' if found.seeds > 1 else ''})"
-        return " ".join(filter(None, (self.title, interval(found, self.digits), self.where, of)))
-
-    def pair(self, row: str, other: str) -> tuple[list[int], list[float]]:
-        """Return the seeds that both have, and the mean of each on these, or on all of its own where there are none."""
-        shared = [seed for seed in self.scores[row] if seed in self.scores[other]]
-        return shared, [fmean(of[seed] for seed in shared or of) for of in (self.scores[row], self.scores[other])]
-
-    def leads(self, row: str, other: str) -> bool:
-        """Return whether the mean of a method is the higher one."""
-        _, (mean, its) = self.pair(row, other)
-        return mean > its
-
-    def best(self, rows: Sequence[str]) -> str | None:
-        """Return the one of `rows` that no other leads."""
-        best: str | None = None
-        for row in sorted(rows, key=lambda row: self.worth(row).value, reverse=True):
-            best = row if best is None or self.leads(row, best) else best
-        return best
-
-
-def _basis(results: Results) -> _Basis:
-    """Return what methods are compared by: the score in the target, else the success that judges predict."""
-    choice = None if results.tested_in == "target" else results.choice()
-    if choice is None:
-        headline, rows = results.headline, results.tested(results.largest)
-        scores = {row: found for row in rows if (found := results.values(row, headline.measure))}
-        return _Basis(scores, headline.title, results.where, headline.digits, results.bounds(headline.measure))
-    predicted: dict[str, dict[int, float]] = {}
-    for one in choice.candidates:
-        predicted.setdefault(one.row, {})[one.seed] = one.predicted
-    return _Basis(predicted, "predicted success", "", 2, {"limit": 1.0, "trials": choice.judged.episodes})
-
-
 def verdict_of(results: Results) -> Verdict:
     """Return which method of results to deploy, at the largest size of the dataset."""
     percent, in_target = results.largest if results.sizes else None, results.tested_in == "target"
-    basis = _basis(results)
-    rivals = [row for row in results.contenders() if row in basis.scores]
-    best = basis.best(rivals)
-    if best is None:
+    scores = {row: found for row in results.tested() if (found := _scores(results, row))}
+    worth = {row: summarize([*found.values()], **_bounds(results)) for row, found in scores.items()}
+    rivals = {row: worth[row] for row in results.contenders() if row in worth}
+    if not (best := _best(results, rivals)):
         return Verdict(None, 0, percent, "No method to deploy: all of them are references (floor or ceiling).", [], [])
-    floor = basis.best([row for row in basis.scores if method_role(row) == "floor"])
-    title, score = method_title(best), basis.text(best)
-    lines = [("best", f"{title}: {score}"), ("interval", _difference(basis, best, floor))]
+    floor = _best(results, {row: found for row, found in worth.items() if method_role(row) == "floor"})
+    title, score = method_title(best), _text(results, worth[best])
+    lines = [("best", f"{title}: {score}"), ("interval", _difference(results, best, floor))]
     if floor:
         note = "what no correction of the simulator reaches"
-        lines.insert(1, ("floor", f"{method_title(floor)} ({note}): {basis.text(floor)}"))
+        lines.insert(1, ("floor", f"{method_title(floor)} ({note}): {_text(results, worth[floor])}"))
     limit = results.headline.limit
     least = -np.inf if limit is None else ENOUGH * limit
-    is_beaten = floor is not None and not basis.leads(best, floor)
+    is_beaten = floor is not None and not gt(*_pair(results, best, floor)[1])
     learned = {row: results.score_of(row, SIMULATED) for row in rivals}
     poor = {row: found.value for row, found in learned.items() if found and found.value < least}
     poor = dict(sorted(poor.items(), key=lambda item: item[0] not in results.compare))
@@ -120,7 +71,7 @@ def verdict_of(results: Results) -> Verdict:
     chosen, advice = None, "Deploy" if in_target else "Try first"
     first = floor if floor and is_beaten else best
     failed = results.summary(first, "failed") if in_target and limit is not None else None
-    if basis.worth(first).value < least:
+    if worth[first].value < least:
         text = "{} did not learn its own simulator ({})"
         why = [text.format(method_title(row), results.headline.text(found)) for row, found in poor.items()]
         if not why:
@@ -131,17 +82,59 @@ def verdict_of(results: Results) -> Verdict:
     else:
         chosen, why_it = first, ", the floor: no method does better" if is_beaten else f": {score}"
         text = f"{advice} **{method_title(first)}**{why_it}."
-    remarks = [*causes, *_limits(results, basis, best)]
+    remarks = [*causes, *_limits(results, worth, best)]
     return Verdict(chosen, _seed(results, chosen) if chosen else 0, percent, text, lines, remarks)
 
 
-def _difference(basis: _Basis, best: str, floor: str | None) -> str:
+def _judges(results: Results) -> Choice | None:
+    """Return the choice whose predictions methods are compared by where no target tested them, if there is one."""
+    return None if results.tested_in == "target" else results.choice()
+
+
+def _scores(results: Results, row: str) -> dict[int, float]:
+    """Return by what methods are compared, by seed: the score in the target, else the success that judges predict."""
+    if judges := _judges(results):
+        return {one.seed: one.predicted for one in judges.candidates if one.row == row}
+    return results.values(row, results.headline.measure)
+
+
+def _bounds(results: Results) -> dict[str, Any]:
+    """Return the limit of these scores, and of how many episodes each is the share."""
+    judges = _judges(results)
+    return {"limit": 1.0, "trials": judges.judged.episodes} if judges else results.bounds(results.headline.measure)
+
+
+def _pair(results: Results, row: str, other: str) -> tuple[list[int], list[float]]:
+    """Return the seeds that both have, and the mean of each on these, or on all of its own where there are none."""
+    sides = [_scores(results, one) for one in (row, other)]
+    shared = [seed for seed in sides[0] if seed in sides[1]]
+    return shared, [fmean(of[seed] for seed in shared or of) for of in sides]
+
+
+def _best(results: Results, worth: Mapping[str, Estimate]) -> str | None:
+    """Return the method with the highest mean, beside each of the others."""
+    best: str | None = None
+    for row in sorted(worth, key=lambda row: worth[row].value, reverse=True):
+        best = row if best is None or gt(*_pair(results, row, best)[1]) else best
+    return best
+
+
+def _text(results: Results, found: Estimate) -> str:
+    seeds = f"({found.seeds} seed{'s' if found.seeds > 1 else ''})"
+    if _judges(results):
+        return f"predicted success {interval(found)} {seeds}"
+    headline = results.headline
+    return f"{headline.title} {interval(found, headline.digits)} {results.where} {seeds}"
+
+
+def _difference(results: Results, best: str, floor: str | None) -> str:
     if floor is None:
         return "no floor to compare with: expected `direct_transfer` among the finished methods"
-    found = paired_difference(basis.scores[best], basis.scores[floor], **basis.bounds)
+    found = paired_difference(*(_scores(results, row) for row in (best, floor)), **_bounds(results))
     if found is None:
         return f"{method_title(best)} and {method_title(floor)} share no seed"
-    text = f"{method_title(best)} less {method_title(floor)}: {interval(found, basis.digits)}"
+    value = interval(found, 2 if _judges(results) else results.headline.digits)
+    text = f"{method_title(best)} less {method_title(floor)}: {value}"
     if found.low is None or found.high is None:
         return f"{text}, of too few seeds for an interval: run {LEAST_SEEDS} or more"
     return f"{text}, 95 %" + (": these seeds do not show a difference" if found.low <= 0 <= found.high else "")
@@ -178,33 +171,28 @@ def _lost(results: Results, row: str) -> Iterator[str]:
             )
 
 
-def _limits(results: Results, basis: _Basis, best: str) -> Iterator[str]:
+def _limits(results: Results, worth: Mapping[str, Estimate], best: str) -> Iterator[str]:
     """Yield what limits the comparison."""
-    choice, count = results.choice(), len(basis.scores[best])
+    choice, seeds = results.choice(), _scores(results, best).keys()
     if results.trials and results.trials.choice:
         yield f"{results.trials.spent} trials in the target choose {results.trials.choice}."
-    if count < LEAST_SEEDS:
-        yield f"Intervals are not shown: they need {LEAST_SEEDS} seeds, {method_title(best)} has {count}."
-    for row in basis.scores:
-        shared, means = basis.pair(best, row)
+    if len(seeds) < LEAST_SEEDS:
+        yield f"Intervals are not shown: they need {LEAST_SEEDS} seeds, {method_title(best)} has {len(seeds)}."
+    for row in worth:
+        shared, means = _pair(results, best, row)
         is_compared = row in results.contenders() or method_role(row) == "floor"
-        is_alike = basis.scores[row].keys() == basis.scores[best].keys()
-        is_plain = len(shared) >= LEAST_SEEDS and basis.worth(best).value >= basis.worth(row).value
-        if is_compared and not (is_alike or is_plain):
-            on = (
-                f"on seed{'s' * (len(shared) > 1)} {listed([*map(str, shared)])}"
-                if shared
-                else "on other seeds, as they share none"
-            )
-            values = " and ".join(f"{mean:.{basis.digits}f}" for mean in means)
+        is_plain = len(shared) >= LEAST_SEEDS and worth[best].value >= worth[row].value
+        if is_compared and not is_plain and _scores(results, row).keys() != seeds:
+            on = f"on seed{'s' * (len(shared) > 1)} {listed([*map(str, shared)])}" if shared else "on other seeds"
             more = "" if len(shared) >= LEAST_SEEDS else f"; run the missing ones, to share {LEAST_SEEDS} or more"
+            values = " and ".join(map("{:.4g}".format, means))
             yield f"{method_title(best)} and {method_title(row)} are compared {on}: {values}{more}."
     if choice and results.tested_in == "target" and choice.best.row != best:
         yield (
             f"Without the target, the judges (simulators that did not train a policy) choose "
             f"{choice.best.name}, with a predicted success of {choice.best.predicted:.2f}."
         )
-    if unjudged := [method_title(row) for row in results.contenders() if row not in basis.scores]:
+    if unjudged := [method_title(row) for row in results.contenders() if row not in worth]:
         yield f"Not judged, so not compared: {', '.join(unjudged)}."
 
 

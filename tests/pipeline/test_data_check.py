@@ -119,28 +119,24 @@ def test_data_of_which_none_is_left_to_train_on_are_refused(recipe: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    ("percent", "told"),
+    ("percent", "copies", "told"),
     [
-        ("[50, 100]", ""),
-        ("[100, 25]", "25 % of fake@data-1.0.0: recorded episodes: 1, of which 1 would be held out"),
-        ("[10, 50]", "10 % of fake@data-1.0.0: recorded episodes: 0, of which 0 would be held out"),
+        ("[50, 100]", {}, ""),
+        ("[100, 25]", {}, "25 % of fake@data-1.0.0: recorded episodes: 1, of which 1 would be held out"),
+        ("[10, 50]", {}, "10 % of fake@data-1.0.0: recorded episodes: 0, of which 0 would be held out"),
+        ("[50, 100]", {"source_episode": 0}, "50 % of fake@data-1.0.0: recorded episodes: 1, of which 1"),
     ],
 )
-def test_the_smallest_size_of_a_sweep_has_to_leave_some(recipe: Path, percent: str, told: str) -> None:
-    write_logs(recipe.parent / "logs", -1.0, 4.0, held_out=[False] * 4)
+def test_the_smallest_size_of_a_sweep_has_to_leave_some(
+    recipe: Path, percent: str, copies: dict[str, int], told: str
+) -> None:
+    write_logs(recipe.parent / "logs", -1.0, 4.0, held_out=[False] * 4, **copies)
     recipe.write_text(recipe.read_text() + f"[sweep]\npercent = {percent}\n")
     if told:
         with pytest.raises(BadInputError, match=told):
             check(recipe, root=recipe.parent / "runs")
     else:
         assert check(recipe, root=recipe.parent / "runs")["data"].state == "finished"
-
-
-def test_copies_of_one_recording_are_one_in_a_size_of_a_sweep(recipe: Path) -> None:
-    write_logs(recipe.parent / "logs", -1.0, 4.0, held_out=[False] * 4, source_episode=0)
-    recipe.write_text(recipe.read_text() + "[sweep]\npercent = [50, 100]\n")
-    with pytest.raises(BadInputError, match=r"50 % of fake@data-1\.0\.0: recorded episodes: 1, of which 1"):
-        check(recipe, root=recipe.parent / "runs")
 
 
 def test_a_task_of_ones_own_is_walked_through_before_a_run(recipe: Path) -> None:

@@ -108,6 +108,8 @@ def test_who_steps_the_target_gets_threads_and_networks_a_device(tmp_path: Path)
     assert on_device == {"ground", "train", "align"}
     settings = {item.key: item.call.keywords.get("settings") for item in items}  # type: ignore[attr-defined]
     assert settings["train/target/seed_0"] is not None and settings["train/astra/seed_0"] is None
+    recorded = {item.key: item.call.keywords.get("recorded") for item in items}  # type: ignore[attr-defined]
+    assert recorded["evaluate/target/seed_0"] is None and recorded["evaluate/astra/seed_0"] == tmp_path / "pair/seed_0"
 
 
 @pytest.mark.parametrize(
@@ -182,13 +184,6 @@ def test_the_judge_is_grounded_even_if_its_row_is_left_out(tmp_path: Path) -> No
     assert "ground/nas/seed_7" not in items["select"].inputs
 
 
-def test_policies_of_a_size_are_judged_at_that_size(tmp_path: Path) -> None:
-    recipe = load(tmp_path, SELECT + "[sweep]\npercent = [50, 150]\n")
-    items = {item.key: item for item in plan(recipe, tmp_path / "r.toml", tmp_path)}
-    inputs = items["select"].inputs
-    assert "train/nas/percent_050/seed_0" in inputs and "ground/nas/percent_150/seed_7" in inputs
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -218,14 +213,6 @@ def test_the_last_stage_is_one_of_those_made() -> None:
     assert stages_until(None) - stages_until("select") == {"evaluate", "report"}
     with pytest.raises(BadInputError, match=r"unknown stage 'grond'.*ground"):
         stages_until("grond")
-
-
-def test_who_was_trained_in_the_target_goes_beyond_no_recorded_commands(tmp_path: Path) -> None:
-    text = HEAD.replace('"astra_plus"', '"target"')
-    items = plan(load(tmp_path, text), tmp_path / "r.toml", tmp_path)
-    calls = {item.key: item.call for item in items if item.key.startswith("evaluate")}
-    known = {key: call.keywords["recorded"] for key, call in calls.items() if isinstance(call, partial)}
-    assert known["evaluate/target/seed_0"] is None and known["evaluate/astra/seed_0"] == tmp_path / "pair/seed_0"
 
 
 def test_a_stage_is_named_as_the_function_that_makes_it() -> None:

@@ -45,16 +45,13 @@ def test_what_needs_a_maze_is_refused_where_there_is_none(tmp_path: Path, more: 
         load_experiment(path, tmp_path)
 
 
-@pytest.mark.parametrize("task", ["nao-navigation", "antmaze-umaze"])
-def test_legs_of_another_length_are_for_tasks_that_have_them(tmp_path: Path, task: str) -> None:
+def test_legs_of_another_length_are_for_tasks_that_have_them(tmp_path: Path) -> None:
     path = tmp_path / "legs.toml"
-    recipe = f'task = "{task}"\nmethods = ["astra"]\nseeds = [0]\n[evaluate]\nleg_scale = '
-    path.write_text(f"{recipe}1.0\n")
-    assert load_experiment(path, tmp_path).recipe.evaluate.leg_scale == 1.0
-    path.write_text(f"{recipe}1.25\n")
-    if task == "antmaze-umaze":
-        assert load_experiment(path, tmp_path).recipe.evaluate.leg_scale == 1.25
-        return
+    recipe = 'task = "{}"\nmethods = ["astra"]\nseeds = [0]\n[evaluate]\nleg_scale = {}\n'
+    for given in (("nao-navigation", 1.0), ("antmaze-umaze", 1.25)):
+        path.write_text(recipe.format(*given))
+        assert load_experiment(path, tmp_path).recipe.evaluate.leg_scale == given[1]
+    path.write_text(recipe.format("nao-navigation", 1.25))
     with pytest.raises(RecipeError, match=r"evaluate\.leg_scale: nao-navigation has legs of one length"):
         load_experiment(path, tmp_path)
 

@@ -5,9 +5,7 @@ from math import ceil
 from pathlib import Path
 from statistics import fmean
 
-import numpy as np
 import pytest
-from scipy.stats import binom
 
 from astra_data.core.errors import BadInputError
 from astra_data.reports.artifacts import read_json
@@ -179,10 +177,6 @@ def test_a_candidate_stands_by_all_its_trials_so_far() -> None:
     assert [*standings(JUDGED, None, [FIRST])] == [("astra", 1), ("nas", 1)]
 
 
-def drawn(success: Sequence[float], rng: np.random.Generator) -> Attempt:
-    return lambda _, those, each: [int(rng.binomial(each, success[one])) for one in those]
-
-
 Rounds = list[tuple[tuple[int, ...], int]]
 
 
@@ -237,22 +231,3 @@ def test_trials_outweigh_a_wrong_prediction_and_a_prediction_counts_as_a_few() -
     assert halve([1.0, 0.0], 4 * PSEUDO_TRIALS, certain([0, 1]))[0] == 1
     # With as many trials as the prediction counts as, a full swing is a tie; with fewer, it prevails.
     assert halve([1.0, 0.0], 2 * PSEUDO_TRIALS, certain([0, 1]))[0] == 0
-
-
-def test_the_best_of_four_is_found_as_often_as_all_outcomes_say() -> None:
-    """Two rounds: two trials each, then four each for the better two; every outcome, weighed."""
-    priors, success = (0.6, 0.5, 0.5, 0.4), (0.2, 0.3, 0.5, 0.8)
-    expected = 0.0
-    for first in product(range(3), repeat=4):
-        weight = float(np.prod(binom.pmf(first, 2, success)))
-        means = [(4 * prior + count) / 6 for prior, count in zip(priors, first, strict=True)]
-        one, other = sorted(range(4), key=lambda n: (-means[n], n))[:2]
-        for second in product(range(5), repeat=2):
-            chance = binom.pmf(second[0], 4, success[one]) * binom.pmf(second[1], 4, success[other])
-            ends = [(4 * priors[n] + first[n] + more) / 10 for n, more in zip((one, other), second, strict=True)]
-            tied, wins = ends[0] == ends[1], ends[0] > ends[1]
-            chosen = min(one, other) if tied else one if wins else other
-            expected += weight * chance * (chosen == 3)
-    rng = np.random.default_rng(0)
-    found = [halve(priors, 16, drawn(success, rng))[0] == 3 for _ in range(4000)]
-    assert np.mean(found) == pytest.approx(expected, abs=0.025)

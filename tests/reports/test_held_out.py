@@ -9,6 +9,7 @@ import pytest
 from astra_data.core.errors import BadInputError
 from astra_data.reports.figures.charts import reliability
 from astra_data.reports.held_out import write_held_out
+from astra_data.reports.runs import Selection
 
 
 def write(root: Path, percent: int, seed: int, error: float, **more: Any) -> None:
@@ -26,7 +27,7 @@ def write(root: Path, percent: int, seed: int, error: float, **more: Any) -> Non
 
 
 def page(root: Path, *percents: int, seeds: tuple[int, ...] = (0,), rows: tuple[str, ...] = ("nas",)) -> str:
-    path = write_held_out("r", root, rows, seeds, percents, timestep_s=0.05)
+    path = write_held_out("r", root, Selection(rows, seeds, percents), timestep_s=0.05)
     assert path == root / "gap.md"
     return path.read_text()
 
@@ -113,7 +114,7 @@ def test_rows_may_have_other_sizes(tmp_path: Path) -> None:
 
 
 def test_nothing_finished_is_no_page_and_a_malformed_file_one_line(tmp_path: Path) -> None:
-    assert write_held_out("r", tmp_path, ("nas",), (0,), (25,), timestep_s=0.1) is None
+    assert write_held_out("r", tmp_path, Selection(("nas",), (0,), (25,)), timestep_s=0.1) is None
     write(tmp_path, 25, 0, 0.1)
     (tmp_path / "ground/nas/percent_025/seed_0/gap.json").write_text("{}")
     with pytest.raises(BadInputError, match="is not what its stage writes"):

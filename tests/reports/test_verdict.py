@@ -70,11 +70,11 @@ def test_methods_are_compared_on_the_seeds_that_both_have() -> None:
         return verdict_of(fake_runs.results(*lines, episodes=120))
 
     found = among("nas", seeds=nas)
-    assert found.row == "nas" and "NAS and ASTRA are compared on seeds 0, 1 and 2: 0.95 and 0.90." in found.remarks
+    assert found.row == "nas" and "NAS and ASTRA are compared on seeds 0, 1 and 2: 0.95 and 0.9." in found.remarks
     assert among("direct_transfer", seeds=nas).row == "direct_transfer"
     few, none = among("nas", seeds=(2, 3, 4)), among("direct_transfer", seeds=(3, 4, 5))
-    assert "NAS and ASTRA are compared on seed 2: 0.95 and 0.90; run the missing ones, to share 3" in words(few)
-    assert none.row == "astra" and "on other seeds, as they share none: 0.90 and 0.20; run the" in words(none)
+    assert "NAS and ASTRA are compared on seed 2: 0.95 and 0.9; run the missing ones, to share 3" in words(few)
+    assert none.row == "astra" and "on other seeds: 0.9 and 0.2; run the" in words(none)
     assert "compared" not in words(among("nas", seeds=(0, 1, 2)))
 
 

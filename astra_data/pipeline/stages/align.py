@@ -126,9 +126,6 @@ def align(
         if config.inputs:
             apart = _estimate_apart(encoder, held_out.windows, held_out.target_state)
             agreement |= {"estimate_rmse": (apart.square().mean(0).sqrt() * encoder.abstract_std).tolist()}
-            encodes = "ψ^t" if encoder.is_deployed else "ψ^s on the estimated abstract state"
-            r2 = agreement["latent_r2"]
-            progress(1.0, f"ψ^t explains {r2:.2f} of the latents' variance: the policy runs with {encodes}")
         metrics: dict[str, Any] = made | {
             **descent.stopwatch.spent(),
             "points": descent.points,

@@ -315,7 +315,14 @@ def collect(
         >>> drives = collect("antmaze-umaze", CollectConfig(episodes=2, max_steps=5), out=Path("drives"))
     """
     world = task_named(task)
-    description = _description(world, config, seed, name)
+    description = {
+        "name": f"{world.name}-{config.behavior}-seed{seed}".replace("_", "-") if name is None else name,
+        "version": "1.0.0",
+        "stage": "collect",
+        "config": config.model_dump(mode="json"),
+        "seeds": {"collect": seed, "subset": derive(seed, "subset")},
+        "environment": {"id": world.name, "timestep_s": world.timestep_s, **world.facts},
+    }
     folder = out or home_of(description)
     with StagedWriter(
         folder,
@@ -329,8 +336,23 @@ def collect(
         share = _TRAINING_SHARE if config.behavior.startswith("suboptimal") else 0.0
         training = part(progress, 0.0, share)
         behavior, metadata = _behavior(world, config, seed, writer, num_threads, training)
-        stopwatch, trained = Stopwatch(metadata.get("spent")), time.perf_counter()
-        steps = _record(world, config, behavior, seed, writer, num_threads, part(progress, share, 1.0))
+        stopwatch, trained, steps = Stopwatch(metadata.get("spent")), time.perf_counter(), 0
+        anywhere = world.plane is not None if config.start is None else config.start == "anywhere"
+        recording = part(progress, share, 1.0)
+        for first in range(0, config.episodes, _NUM_ENVS):
+            rows = range(first, min(first + _NUM_ENVS, config.episodes))
+            before = sum(length for staged, length in writer.lengths.items() if staged < first)
+            if config.least_steps and before >= config.least_steps:
+                break
+            if writer.staged.keys() >= set(rows):
+                continue
+            batch_seed = derive(seed, f"episodes from {first}") if first else seed
+            drawn = derive(batch_seed, "collect")
+            env = world.target(len(rows), seed=drawn, start_anywhere=anywhere, num_threads=num_threads)
+            env.reset()
+            act = behavior(len(rows), batch_seed)
+            shown = part(recording, rows.start / config.episodes, rows.stop / config.episodes)
+            steps += record(world, env, act, rows, writer, max_steps=config.max_steps, seed=seed, progress=shown)
         if config.least_steps:
             _keep(config.least_steps, writer)
         rate = steps / (time.perf_counter() - trained)
@@ -340,46 +362,6 @@ def collect(
     note = f"return {metadata['return_mean']:.2f}, success {metadata['success_rate']:.2f}"
     progress(1.0, f"{len(returns)} episodes, {note}, {rate:,.0f} target steps/s")
     return folder
-
-
-def _description(world: Task, config: CollectConfig, seed: int, name: str | None) -> dict[str, Any]:
-    return {
-        "name": f"{world.name}-{config.behavior}-seed{seed}".replace("_", "-") if name is None else name,
-        "version": "1.0.0",
-        "stage": "collect",
-        "config": config.model_dump(mode="json"),
-        "seeds": {"collect": seed, "subset": derive(seed, "subset")},
-        "environment": {"id": world.name, "timestep_s": world.timestep_s, **world.facts},
-    }
-
-
-def _record(
-    world: Task,
-    config: CollectConfig,
-    behavior: Behavior,
-    seed: int,
-    writer: StagedWriter,
-    num_threads: int | None,
-    progress: Progress,
-) -> int:
-    """Record the episodes that `writer` lacks, `_NUM_ENVS` at once; return the number of their steps."""
-    steps = 0
-    for first in range(0, config.episodes, _NUM_ENVS):
-        rows = range(first, min(first + _NUM_ENVS, config.episodes))
-        before = sum(length for staged, length in writer.lengths.items() if staged < first)
-        if config.least_steps and before >= config.least_steps:
-            break
-        if writer.staged.keys() >= set(rows):
-            continue
-        batch_seed = derive(seed, f"episodes from {first}") if first else seed
-        anywhere = world.plane is not None if config.start is None else config.start == "anywhere"
-        drawn = derive(batch_seed, "collect")
-        env = world.target(len(rows), seed=drawn, start_anywhere=anywhere, num_threads=num_threads)
-        env.reset()
-        act = behavior(len(rows), batch_seed)
-        shown = part(progress, rows.start / config.episodes, rows.stop / config.episodes)
-        steps += record(world, env, act, rows, writer, max_steps=config.max_steps, seed=seed, progress=shown)
-    return steps
 
 
 def _keep(least_steps: int, writer: StagedWriter) -> None:

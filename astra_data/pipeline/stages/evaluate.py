@@ -103,6 +103,8 @@ def evaluate(
         row = _Row(partial(careful, world), {"source": partial(_careful_in_target, world)}, "source")
     else:
         row = _policy(world, policy if isinstance(policy, PolicyFile) else None, read, config)
+    if not (world.has_target or row.shown_abstract):
+        raise BadInputError(f"the policy of '{method}' observes the full state of a target, and {world.name} has none")
     simulators = dict(row.simulators)
     if row.shown_abstract:
         groundings: dict[str, Grounding] = {"raw": NO_GROUNDING}

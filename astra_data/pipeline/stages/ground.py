@@ -1,10 +1,8 @@
 """Ground: fit a correction of the abstract simulator, and report its open-loop error."""
 
 import json
-from collections.abc import Mapping
 from contextlib import chdir
 from pathlib import Path
-from typing import Any
 
 from pydantic import ValidationError
 
@@ -79,20 +77,7 @@ def ground(
         if not is_of_package(base_method(method)):
             check_step(world, grounding, written, held_out)
         gap = gap_report(world, written, held_out, seed=seed)
-        progress(1.0, _derived(figures))
         spent = stopwatch.spent()
         figures |= spent | {clock: figures[clock] + spent[clock] - fit_end[clock] for clock in CLOCKS}
         (folder / METRICS).write_text(json.dumps(figures, indent=1))
         (folder / GAP).write_text(json.dumps(gap, indent=1))
-
-
-def _derived(figures: Mapping[str, Any]) -> str:
-    """Return in one line what the data decided of a history model."""
-    parts = []
-    if "updates" in figures:
-        parts.append(f"{figures['updates']} updates of windows of {figures['window']}")
-    if (shrinkage := figures.get("reward_shrinkage")) is not None:
-        parts.append(f"residual reward times {shrinkage:.2f}")
-    if failures := figures.get("failure_model"):
-        parts.append(f"failure model {'with' if failures['latent'] else 'without'} latent")
-    return ", ".join(parts) or "fitted"

@@ -85,7 +85,9 @@ def report(
         write_file(folder / JSON, results_json(found))
         write_file(folder / PAGE, markdown(found.recipe, sections, shown))
 
-    with finished_folder(root / "report", replace=True, made_from=_digests(recipe, root)) as folder:
+    read = {key: root / key / EVALUATION for key in recipe.points()} | {FOLDER: root / FOLDER / SELECTED}
+    made_from = {key: file_digest(file) for key, file in read.items() if file.exists()}
+    with finished_folder(root / "report", replace=True, made_from=made_from) as folder:
         write(folder)
         write_file(folder / HTML, html(found.recipe, sections, images))
     if publish is not None:
@@ -100,8 +102,3 @@ def _added_to(published: Sequence[Path], found: Results) -> Results:
         if changed := replaced(one, found):
             _log.warning("%s: new results replace those of %s", path, "; ".join(changed))
     return merge([*earlier, found]) if earlier else found
-
-
-def _digests(recipe: Reported, root: Path) -> dict[str, str]:
-    read = {key: root / key / EVALUATION for key in recipe.points()} | {FOLDER: root / FOLDER / SELECTED}
-    return {key: file_digest(file) for key, file in read.items() if file.exists()}

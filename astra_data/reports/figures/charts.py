@@ -173,7 +173,6 @@ def open_loop_error(results: Results, _: style.Scene) -> Figure | None:
     figure = Figure(figsize=(1.7 + 2.9 * len(quantities), 3.3), layout="constrained")
     grid = figure.subplots(1, len(quantities), squeeze=False)[0]
     for axes, quantity in zip(grid, quantities, strict=True):
-        bands = {row: means.loc[(row, "grounded", quantity)] for row in rows}
         drawn: list[Floats] = []
         for row in rows:
             raw = means.loc[(row, "raw", quantity)]
@@ -182,7 +181,8 @@ def open_loop_error(results: Results, _: style.Scene) -> Figure | None:
                 label = None if drawn else "no grounding"
                 style.draw_band(axes, raw.index, *values, color=style.INK, ls=":", label=label, marker="o", ms=3.5)
                 drawn.append(values)
-        for row, band in bands.items():
+        for row in rows:
+            band = means.loc[(row, "grounded", quantity)]
             style.draw_band(axes, band.index, *band.to_numpy().T, **style.look(row), marker="o", ms=3.5)
         ending = next((ending for ending in _UNITS if quantity.endswith(ending)), "")
         name = f"{quantity.removesuffix(ending).replace('_', ' ')} error"

@@ -252,12 +252,6 @@ def test_whole_numbers_outcomes_and_goals_are_not_moved() -> None:
     assert [column.name for column in _moving(source)] == [STATE, "force"]
 
 
-def test_copies_differ_from_what_they_are_of() -> None:
-    assert AugmentConfig(rotations="none").translations
-    with pytest.raises(ValueError, match="expected rotations or translations, got neither"):
-        AugmentConfig(rotations="none", translations=False)
-
-
 @pytest.mark.parametrize(
     ("changes", "told"),
     [

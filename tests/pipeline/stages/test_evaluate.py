@@ -208,6 +208,11 @@ def test_without_a_target_starts_and_goals_are_those_of_the_simulator_that_is_re
     assert told["tested_in"] == "grounded" and "target" not in told
     assert torch.equal(paths["start"], paths["grounded.position"][:, 0])
     assert paths["goal"].shape == (CONFIG.episodes, 2)
+    full = ActorCritic(PolicyShape(observation_size=33, action_size=2))
+    given = PolicyFile.load(trained / "policy.safetensors")
+    replace(given, policy=full, simulation=None, observed="full").save(tmp_path / "policy.safetensors")
+    with pytest.raises(BadInputError, match="'iql' observes the full state of a target, and blind has none"):
+        make("blind", "iql", tmp_path / "full", {"policy": tmp_path})
 
 
 def test_the_same_seed_gives_the_same_outcome_on_any_number_of_threads(

@@ -93,17 +93,6 @@ def test_an_episode_ends_at_the_goal_or_where_it_topples(toppled_at: int | None,
     assert judged["next.reward"][:-1].mean() == pytest.approx(0.1, abs=0.02)
 
 
-def test_each_copy_has_a_goal_of_its_own_among_those_of_the_task() -> None:
-    path = straight((-4.0, 4.0), (-3.9, 4.0), 20)
-    columns = {**path.columns, keys.GOAL: np.tile(AIM, (20, 1)), keys.TERMINATED: np.zeros(20, bool)}
-    episode = keys.Episode(0, columns | {keys.SUCCESS: np.zeros(20, bool)})
-    moving, rng = [TASK.state, replace(TASK.state, name=keys.NEXT_STATE), TASK.action], np.random.default_rng(0)
-    copies = [relocation().copied(episode, moving, rng) for _ in range(12)]
-    goals = np.array([copy[0][keys.GOAL] for copy in copies if copy is not None])
-    assert len(goals) == 12 and (goals == goals[:, :1]).all() and len(np.unique(goals[:, 0], axis=0)) == 12
-    assert 0.0 < np.abs(goals - AIM).max() <= 0.6 + 1e-6
-
-
 def kick(steps: int, ball_m: float, *, ends: bool = False) -> keys.Episode:
     """Return an episode of a robot that stands at the origin, and whose ball rolls on by `ball_m` a step."""
     state = np.zeros((steps + 1, KICKING.state.size), np.float32)

@@ -266,6 +266,8 @@ def test_lasting_tasks_are_reported_by_survived_steps_and_return(
     assert "| **ASTRA** | 250 ± 303 |" in page
     assert images(root / "report") == {"steps", "return", "learning", "gap", "validity", "trajectories"}
     assert found.trainings[-1].score != [] and [10.0, 20.0] in [one.score for one in found.trainings]
+    objective.scores = (RETURN,)  # which no learning curve has
+    assert np.isnan([value for one in make(root).trainings for value in one.score]).all()
 
 
 def test_what_no_target_tested_is_said_before_all_else(root: Path) -> None:

@@ -123,6 +123,7 @@ def test_another_policy_is_judged_anew_after_an_interruption(root: Path, monkeyp
 def test_who_learned_in_the_target_or_nowhere_is_not_judged(root: Path) -> None:
     half, whole = benches(reported(root, methods=("follower", "target", "full_obs", "nas"), percents=(50, 100)), "nas")
     assert {one.row for one in half.entries} == {"nas"} and (half.percent, whole.percent) == (50, 100)
+    assert {"train/nas/percent_050/seed_0", "ground/nas/percent_050/seed_2"} < {*half.keys}
 
 
 def test_judges_of_the_same_episodes_are_named(root: Path) -> None:
