@@ -1,6 +1,5 @@
 """Commands that edit datasets, show them, check them and compare them."""
 
-from json import dumps
 from pathlib import Path
 from shlex import quote
 from typing import Annotated, Any
@@ -8,7 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from astra_data.cli import arguments
-from astra_data.core.durable import refuse_existing, write_file
+from astra_data.core.durable import write_file
 from astra_data.core.errors import AstraDataError, BadInputError, CorruptDatasetError
 from astra_data.core.naming import RUNS, first_few, printable
 
@@ -91,8 +90,7 @@ def trim(
         bool, typer.Option("--still", help="Remove the steps at either end in which the state does not change.")
     ] = False,
     without: Annotated[
-        str | None,
-        typer.Option(metavar="CONDITION", help="Remove the steps in which it holds, such as 'v < 0.05'."),
+        str | None, typer.Option(metavar="CONDITION", help="Remove the steps in which it holds, such as 'v < 0.05'.")
     ] = None,
     name: arguments.NewName = None,
     out: arguments.Out = None,
@@ -157,10 +155,6 @@ def inspect(
     plot: Annotated[
         Path | None, typer.Option(help="Folder for figures of positions and velocities.", show_default="no figures")
     ] = None,
-    json: Annotated[
-        Path | None,
-        typer.Option(help="File for the check-up's findings, each with all its episodes.", show_default="no file"),
-    ] = None,
 ) -> None:
     """Show a dataset's values, episodes, a map of visited positions, and what looks wrong."""
     from rich.console import Console
@@ -170,14 +164,9 @@ def inspect(
     from astra_data.dataset.inspection import inspect_dataset
     from astra_data.dataset.versions import open_dataset
 
-    if json is not None:
-        refuse_existing(json)
     found = open_dataset(dataset)
     inspection, checkup = inspect_dataset(found), check_up(found, quote(dataset))
     Console(soft_wrap=True).print(inspection_page(inspection, checkup))
-    if json is not None:
-        write_file(json, dumps(checkup.record(), indent=1, ensure_ascii=False) + "\n")
-        typer.echo(f"written: {json}")
     if plot is None:
         return
     from astra_data.reports.figures.style import coverage, png
@@ -195,24 +184,11 @@ def inspect(
             typer.echo(f"written: {path}")
 
 
-def list_(
-    folders: Annotated[
-        list[Path] | None, typer.Argument(metavar="FOLDER", help="More folders for --clean, such as runs.")
-    ] = None,
-    clean: Annotated[
-        bool, typer.Option("--clean", help="Instead, remove leftovers of killed commands from home and FOLDER.")
-    ] = False,
-    tasks: Annotated[bool, typer.Option("--tasks", help="Instead, list the named tasks.")] = False,
-) -> None:
+def list_(tasks: Annotated[bool, typer.Option("--tasks", help="Instead, list the named tasks.")] = False) -> None:
     """List the datasets in the home folder, and their versions; or the named tasks."""
     if tasks:
         _list_tasks()
         return
-    if clean:
-        _clean(folders or [])
-        return
-    if folders:
-        raise BadInputError("list: folders are for --clean; without it, list shows the datasets in the home folder")
     from rich.table import Table
 
     from astra_data.dataset.description import full_name
@@ -254,26 +230,6 @@ def _list_tasks() -> None:
         "`astra-data check TASK` tests one and shows all its values. Name your own task by its place: "
         "cart.py:TASK or package.module:TASK. Its code is run."
     )
-
-
-def _clean(folders: list[Path]) -> None:
-    from astra_data.core.durable import clean
-    from astra_data.dataset.versions import home
-
-    notes = {
-        "removed": "",
-        "in use": ": another command is writing it",
-        "kept": ": the interrupted command can continue from it; otherwise delete it",
-    }
-    if home().exists():
-        folders = [home(), *folders]
-    if missing := [str(folder) for folder in folders if not folder.is_dir()]:
-        raise BadInputError(f"list --clean: expected folders, got {', '.join(missing)}")
-    found = dict(item for folder in folders for item in clean(folder))
-    for path, state in found.items():
-        typer.echo(f"{state}: {printable(str(path))}{notes[state]}")
-    if not found:
-        typer.echo("found no leftovers of killed commands")
 
 
 def validate(

@@ -228,18 +228,12 @@ def sweep(target: Path) -> None:
         _remove_dead(path)
 
 
-def clean(folder: Path) -> list[tuple[Path, str]]:
-    """Remove what killed processes left below `folder`; return each path and whether it is removed, in use or kept."""
-    found = []
+def clean(folder: Path) -> None:
+    """Remove what killed processes left below `folder`, but for what a command goes on with."""
     for parent, folders, files in os.walk(folder):
-        for name in sorted((*folders, *files)):
-            path = Path(parent, name)
-            if _HIDDEN.fullmatch(name):
-                found.append((path, "removed" if _remove_dead(path) else "in use"))
-            elif name in folders and _RESUMABLE.fullmatch(name):
-                found.append((path, "kept"))
+        for name in filter(_HIDDEN.fullmatch, (*folders, *files)):
+            _remove_dead(Path(parent, name))
         folders[:] = [name for name in folders if not _HIDDEN.fullmatch(name)]
-    return found
 
 
 def begun_beside(target: Path) -> list[Path]:
@@ -248,14 +242,13 @@ def begun_beside(target: Path) -> list[Path]:
     return sorted(path for path in beside if _RESUMABLE.fullmatch(path.name))
 
 
-def _remove_dead(path: Path) -> bool:
-    """Remove a hidden file or folder unless a live process holds it; return whether it is gone."""
+def _remove_dead(path: Path) -> None:
+    """Remove a hidden file or folder unless a live process holds it."""
     with suppress(OSError), held(path) as ours:
         if ours and path.is_dir():
             shutil.rmtree(path, ignore_errors=True)
         elif ours:
             path.unlink()
-    return not path.exists()
 
 
 def _hidden_names(target: Path) -> Iterator[Path]:

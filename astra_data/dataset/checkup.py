@@ -4,8 +4,8 @@ import math
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from typing import Any, Literal, Self
+from dataclasses import dataclass, field
+from typing import Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -244,13 +244,8 @@ MOST_STEPS = 2**13  # steps that a shift is estimated from
 class Checkup:
     """What a check-up found."""
 
-    reference: str  # name and version of the dataset
     summary: tuple[str, ...]  # a line each on how episodes end, on commands and on the rate
     findings: tuple[Finding, ...]  # warnings first
-
-    def record(self) -> dict[str, Any]:
-        """Return it for JSON."""
-        return {"dataset": self.reference, "summary": self.summary, "findings": [*map(asdict, self.findings)]}
 
 
 def check_up(dataset: Dataset, called: str | None = None) -> Checkup:
@@ -302,7 +297,7 @@ def check_up(dataset: Dataset, called: str | None = None) -> Checkup:
     found = sorted(found + more, key=lambda finding: finding.severity != "warning")
     rates = [str(clock) for clock in clocks] or [f"{fps} Hz declared; no time column to compare it with"]
     summary = [f"endings: {line}", *summary, *(f"rate: {rate}" for rate in rates)]
-    return Checkup(dataset.reference, tuple(summary), tuple(found))
+    return Checkup(tuple(summary), tuple(found))
 
 
 def commands(column: Column, episodes: Iterable[Array], extremes: Floats, fps: int) -> tuple[str, list[Finding]]:

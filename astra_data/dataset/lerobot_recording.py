@@ -266,11 +266,7 @@ def open_recording(root: Path) -> dict[str, Any]:
 
 
 def _survey(
-    root: Path,
-    rows: Rows,
-    columns: list[Column],
-    tasks: Mapping[int, str],
-    info: Mapping[str, Any],
+    root: Path, rows: Rows, columns: list[Column], tasks: Mapping[int, str], info: Mapping[str, Any]
 ) -> tuple[list[Found], str, Digests]:
     """Read every value once; return all episodes, hash and digests of what is ours."""
     stored, specs = list(rows.stored.values()), layout.stored_columns(columns)

@@ -116,11 +116,7 @@ class RotatingWriter:
         path.parent.mkdir(parents=True, exist_ok=True)
         self._file = path.open("wb")
         self._writer = pq.ParquetWriter(
-            self._file,
-            self._schema,
-            compression=self._packing,
-            use_dictionary=False,
-            column_encoding=self._encodings,
+            self._file, self._schema, compression=self._packing, use_dictionary=False, column_encoding=self._encodings
         )
 
     def locate(self) -> tuple[int, int]:

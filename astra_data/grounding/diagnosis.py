@@ -112,15 +112,7 @@ def diagnose(dataset: str | Path, simulator: str, progress: Progress = silent) -
         *(_of_forecast(forecast, missed) if known.error.size else ()),
     )
     return Diagnosis(
-        source.reference,
-        recordings,
-        len(log.step),
-        responses,
-        missed,
-        commands,
-        explained,
-        forecast,
-        findings,
+        source.reference, recordings, len(log.step), responses, missed, commands, explained, forecast, findings
     )
 
 

@@ -193,12 +193,7 @@ def _optimize(model: "GroundingModel", weights: "LossWeights", fitting: Fitting)
                 note += f"  held-out R² of the correction {explained:.3f}"
             fitting.progress(descent.share, note)
     descent.finish()
-    return {
-        "stopwatch": descent.stopwatch,
-        "window": window,
-        "updates": descent.best,
-        "epochs": descent.points,
-    }
+    return {"stopwatch": descent.stopwatch, "window": window, "updates": descent.best, "epochs": descent.points}
 
 
 @without_gradients

@@ -96,7 +96,6 @@ MISTAKES = {
     "trim fake --without v<": "expected a condition such as",
     "resample none --fps 10": "no dataset 'none' in",
     "features fake --camera front": "has no camera 'observation.images.front'",
-    "list nowhere": "folders are for --clean",
     "inspect runs": "runs: found no dataset",
     "validate runs": "runs: found no dataset",
     "repair runs --out x": "meta/info.json is missing",

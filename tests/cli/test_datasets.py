@@ -1,4 +1,3 @@
-import json
 import re
 import sys
 from dataclasses import replace
@@ -84,57 +83,30 @@ def test_a_dataset_is_shown_and_drawn(tmp_path: Path) -> None:
     assert matplotlib.image.imread(picture).std() > 0.05
 
 
-def test_findings_are_shown_and_written(tmp_path: Path) -> None:
+def test_findings_are_shown_with_their_remedies(tmp_path: Path) -> None:
     def copied(uid: int, columns: Columns) -> Columns | None:
         return toy_columns(2) if uid > 20 else None
 
     logs = tmp_path / "my logs"
     write_logs(logs, copied)
-    result = call("inspect", str(logs), "--json", str(tmp_path / "found.json"))
-    assert result.exit_code == 0
+    result = call("inspect", str(logs))
     lines = result.output.splitlines()
-    found = json.loads((tmp_path / "found.json").read_text())
-    (finding,) = found["findings"]
-    assert finding["episodes"] == [*range(21, 30)] and f"astra-data filter '{logs}' --without 21" in finding["advice"]
-    shown = "warning: " + finding["what"] + " (episodes 21, 22, 23, 24, 25 and 4 more): " + finding["advice"]
-    assert lines[-5:] == ["check-up", *found["summary"], shown, f"written: {tmp_path / 'found.json'}"][-5:]
-    again = call("inspect", str(logs), "--json", str(tmp_path / "found.json"))
-    assert "found.json exists already" in str(again.exception)
+    assert result.exit_code == 0 and lines[-1].startswith("warning: ") and "check-up" in lines
+    assert " (episodes 21, 22, 23, 24, 25 and 4 more): " in lines[-1]
+    assert f"astra-data filter '{logs}' --without 21" in lines[-1]
 
 
 def test_what_does_not_fit_is_told(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     write_fake(tmp_path / "fake")
     write_fake(tmp_path / "mute", columns=[replace(column, astra=None) for column in COLUMNS])
-    for arguments, told in (
-        ([str(tmp_path / "none")], "no such folder"),
-        (
-            [str(tmp_path / "mute"), "--plot", str(tmp_path / "plots")],
-            "expected a state with the role position or vector",
-        ),
-        ([str(tmp_path / "fake"), "--plot", str(tmp_path / "file")], "cannot be written: "),
+    for name, plot, told in (
+        ("none", "plots", "no such folder"),
+        ("mute", "plots", "expected a state with the role position or vector"),
+        ("fake", "file", "cannot be written: "),
     ):
-        error = call("inspect", *arguments).exception
-        assert isinstance(error, AstraDataError)
-        with pytest.raises(AstraDataError, match=told):
-            raise error
-
-
-def test_what_killed_commands_left_is_removed_on_request(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path / "home"))
-    dead, other = tmp_path / "home/ant/.data-1.0.0.tmp-7", tmp_path / "runs/.recipe.json.tmp-7"
-    staged = tmp_path / "home/.walks.staged"
-    for folder in (dead, other, staged):
-        folder.mkdir(parents=True)
-    assert call("list", "--clean").output.splitlines() == [
-        f"kept: {staged}: the interrupted command can continue from it; otherwise delete it",
-        f"removed: {dead}",
-    ]
-    assert not dead.exists() and other.exists()
-    assert f"removed: {other}" in call("list", "--clean", str(tmp_path / "runs")).output
-    staged.rmdir()
-    assert call("list", "--clean").output == "found no leftovers of killed commands\n"
-    assert "folders are for --clean" in str(call("list", str(tmp_path / "runs")).exception)
+        error = call("inspect", str(tmp_path / name), "--plot", str(tmp_path / plot)).exception
+        assert isinstance(error, AstraDataError) and told in str(error)
 
 
 def test_a_damaged_dataset_hides_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -153,7 +125,7 @@ def test_a_damaged_dataset_hides_no_other(tmp_path: Path, monkeypatch: pytest.Mo
     assert result.output.count("@data-1.0.0") == 3
 
 
-@pytest.mark.parametrize("command", [["list"], ["list", "--clean"], ["inspect", "fake"]])
+@pytest.mark.parametrize("command", [["list"], ["inspect", "fake"]])
 def test_a_home_that_is_no_folder_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: list[str]) -> None:
     (tmp_path / "home").touch()
     monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path / "home"))

@@ -10,7 +10,7 @@ from astra_data.dataset.checkup import Checkup, Finding
 from astra_data.dataset.columns import Column
 from astra_data.dataset.inspection import BINS, Endings, Inspection, Map, Spread
 
-NOTHING = Checkup("fake@data-1.0.0", ("endings: 3 cut", "rate: 20 Hz declared"), ())
+NOTHING = Checkup(("endings: 3 cut", "rate: 20 Hz declared"), ())
 
 
 def test_findings_stand_below_all_else() -> None:

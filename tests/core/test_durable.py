@@ -96,7 +96,7 @@ def test_a_folder_is_whole_or_gone_whenever_its_removal_is_killed(tmp_path: Path
         if folder.exists():
             durable.discard(folder, tmp_path / "set")
     assert at > 5
-    assert [state for _, state in durable.clean(tmp_path)] == ["removed"] * len(names(tmp_path)) or not names(tmp_path)
+    durable.clean(tmp_path)
     assert names(tmp_path) == []
 
 
@@ -133,16 +133,10 @@ def test_cleaning_spares_what_lives_and_what_is_resumed(tmp_path: Path) -> None:
     (dead / "data" / "file").touch()
     os.mkfifo(home / ".pipe.tmp-98")
     with durable.held(alive):
-        found = dict(durable.clean(home))
-    assert found == {
-        dead: "removed",
-        alive: "in use",
-        staged: "kept",
-        home / ".out.hdf5.tmp-99": "removed",
-        home / ".pipe.tmp-98": "removed",
-    }
+        durable.clean(home)
     assert names(home) == [".git", ".notes.partial", ".set.staged", alive.name, "ant", "file", "set.tmp-1"]
-    assert names(home / "ant") == [] and durable.clean(tmp_path / "none") == []
+    assert names(home / "ant") == []
+    durable.clean(tmp_path / "none")
 
 
 def test_the_fault_that_hdf5_hides_in_its_text_is_found() -> None:

@@ -7,14 +7,7 @@ from fake_dataset import COLUMNS, DESCRIPTION, fake_columns, fake_episode, write
 
 from astra_data.dataset import Dataset, DatasetWriter, compare
 from astra_data.dataset.columns import ACTION, STATE, Column, Episode
-from astra_data.dataset.compare import (
-    Differences,
-    column_faults,
-    differences,
-    lineage,
-    names_apart,
-    tree_lines,
-)
+from astra_data.dataset.compare import Differences, column_faults, differences, lineage, names_apart, tree_lines
 from astra_data.dataset.edit import filter_episodes, merge, subset
 
 

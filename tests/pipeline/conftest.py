@@ -3,6 +3,7 @@
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from quick_runs import fit_quickly, run_here, small_tables
@@ -27,29 +28,13 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return small_run(tmp_path_factory)
 
 
-@pytest.fixture(scope="session")
-def collected(small: Path) -> Path:
-    return small / "collect/seed_0"
+def _made(key: str) -> Any:
+    """Return a fixture of the folder that is at `key` in the run."""
+    return pytest.fixture(scope="session")(lambda small: small / key)
 
 
-@pytest.fixture(scope="session")
-def paired(small: Path) -> Path:
-    return small / "pair/seed_0"
-
-
-@pytest.fixture(scope="session")
-def grounded(small: Path) -> Path:
-    return small / "ground/astra/seed_0"
-
-
-@pytest.fixture(scope="session")
-def trained(small: Path) -> Path:
-    return small / "train/astra/seed_0"
-
-
-@pytest.fixture(scope="session")
-def aligned(small: Path) -> Path:
-    return small / "align/astra/seed_0"
+collected, paired = _made("collect/seed_0"), _made("pair/seed_0")
+grounded, trained, aligned = (_made(f"{stage}/astra/seed_0") for stage in ("ground", "train", "align"))
 
 
 @pytest.fixture(scope="session")

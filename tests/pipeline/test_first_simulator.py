@@ -86,12 +86,7 @@ def vessel() -> Columns:
 def drone() -> Columns:
     """Driven along the axes of the world."""
     vx, vy, vz, turn = held((-2, 2), (-2, 2), (-1, 1), (-1, 1))
-    place = {
-        "x": summed(vx),
-        "y": summed(vy),
-        "z": summed(vz),
-        "yaw": wrapped(summed(turn)),
-    }
+    place = {"x": summed(vx), "y": summed(vy), "z": summed(vz), "yaw": wrapped(summed(turn))}
     return place | {"vx_sp": vx, "vy_sp": vy, "vz_sp": vz, "yawspeed_sp": turn}
 
 

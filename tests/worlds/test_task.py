@@ -180,10 +180,7 @@ UNSIZED = type("Unsized", (Objective,), dict.fromkeys(Objective.__abstractmethod
         ({"timestep_s": "0.1"}, "timestep_s: expected a number of seconds, got '0.1'"),
         ({"name": 3}, "name: expected a text, got 3"),
         ({"commands": [(0.0, 1.0)]}, r"commands: expected \(least, largest\) by name, or a dataset, got \[\(0"),
-        (
-            {"objective": Reach},
-            "objective: expected an object of a class .*Objective, got <class",
-        ),
+        ({"objective": Reach}, "objective: expected an object of a class .*Objective, got <class"),
         ({"objective": UNSIZED(horizon=9)}, "Unsized: expected an action_size, the number of commands"),
         ({"timestep_s": 2.0}, "timestep_s: expected above 0 and below 2 s.*: got 2.0"),
         ({"name": "my rail"}, "name: expected letters, digits"),

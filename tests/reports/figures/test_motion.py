@@ -14,12 +14,7 @@ from safetensors.numpy import save_file
 from small_cart import TASK
 from torch import Tensor
 
-from astra_data.reports.figures.motion import (
-    can_replay,
-    dynamics_mismatch,
-    replay_commands,
-    trajectories,
-)
+from astra_data.reports.figures.motion import can_replay, dynamics_mismatch, replay_commands, trajectories
 from astra_data.reports.figures.style import DEPLOYED, SIMULATED, Scene
 from astra_data.reports.results import Results
 from astra_data.robots.nao.tasks import NaoEnv

@@ -18,12 +18,7 @@ from astra_data.robots.humanoid.target import (
     humanoid_model,
     humanoid_to_walker2d,
 )
-from astra_data.robots.humanoid.tasks import (
-    HumanoidExtendedKinematics,
-    HumanoidWalker2d,
-    sole_clearance,
-    walker_model,
-)
+from astra_data.robots.humanoid.tasks import HumanoidExtendedKinematics, HumanoidWalker2d, sole_clearance, walker_model
 
 # The humanoid's velocities that the walker has: x, z, pitch, and the commanded joints.
 SHARED = [0, 2, 4, *(6 + joint for joint in COMMANDED)]
