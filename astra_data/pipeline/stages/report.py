@@ -1,7 +1,7 @@
 """Report: the results of all methods and seeds of a recipe, as results.json, .md, .html and figures."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -56,7 +56,7 @@ def report(
     config: ReportConfig = ReportConfig(),
 ) -> None:
     """Write results.json, .md and .html and figures to `root`/report; with `published` ones, to `publish`/<recipe>."""
-    from astra_data.reports.figures.catalog import FIGURES, drawn
+    from astra_data.reports.figures.catalog import FIGURES, PUBLISHED, drawn
     from astra_data.reports.figures.style import Scene
     from astra_data.reports.page import sections_of
 
@@ -78,7 +78,7 @@ def report(
     progress(0.9, f"{len(images)} figures")
     sections = sections_of(found, f"runs/{root.name}" if root.is_absolute() else str(root))  # as commands name it
 
-    def write(folder: Path) -> None:
+    def write(folder: Path, images: Mapping[str, bytes]) -> None:
         for name, image in images.items():
             write_file(folder / f"{name}.png", image)
         shown = {name: file for name in FIGURES if (folder / (file := f"{name}.png")).exists()}
@@ -88,10 +88,10 @@ def report(
     read = {key: root / key / EVALUATION for key in recipe.points()} | {FOLDER: root / FOLDER / SELECTED}
     made_from = {key: file_digest(file) for key, file in read.items() if file.exists()}
     with finished_folder(root / "report", replace=True, made_from=made_from) as folder:
-        write(folder)
+        write(folder, images)
         write_file(folder / HTML, html(found.recipe, sections, images))
     if publish is not None:
-        write(publish / recipe.name)
+        write(publish / recipe.name, {name: image for name, image in images.items() if name in PUBLISHED})
     progress(1.0, verdict_of(found).text.replace("**", ""))
 
 

@@ -91,6 +91,7 @@ FIGURES = {
         "training",
     ),
 }
+PUBLISHED = ("success", "steps", "return", "trajectories", "gap", "data_efficiency")  # beside the tables
 
 
 def drawn(results: Results, scene: Scene) -> dict[str, bytes]:
