@@ -3,6 +3,7 @@
 import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from inspect import signature
 from pathlib import Path
@@ -135,11 +136,10 @@ def _faults(method: Method) -> Iterator[str]:
 def _takes(function: Callable[..., object], given: Sequence[str]) -> bool:
     """Return whether `function` can be called with as many arguments; what is built in does not tell."""
     try:
-        signature(function).bind(*given)
+        with suppress(ValueError):
+            signature(function).bind(*given)
     except TypeError:
         return False
-    except ValueError:
-        return True
     return True
 
 

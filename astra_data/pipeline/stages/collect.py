@@ -338,7 +338,6 @@ def collect(
         behavior, metadata = _behavior(world, config, seed, writer, num_threads, training)
         stopwatch, trained, steps = Stopwatch(metadata.get("spent")), time.perf_counter(), 0
         anywhere = world.plane is not None if config.start is None else config.start == "anywhere"
-        recording = part(progress, share, 1.0)
         for first in range(0, config.episodes, _NUM_ENVS):
             rows = range(first, min(first + _NUM_ENVS, config.episodes))
             before = sum(length for staged, length in writer.lengths.items() if staged < first)
@@ -351,7 +350,7 @@ def collect(
             env = world.target(len(rows), seed=drawn, start_anywhere=anywhere, num_threads=num_threads)
             env.reset()
             act = behavior(len(rows), batch_seed)
-            shown = part(recording, rows.start / config.episodes, rows.stop / config.episodes)
+            shown = part(part(progress, share, 1.0), rows.start / config.episodes, rows.stop / config.episodes)
             steps += record(world, env, act, rows, writer, max_steps=config.max_steps, seed=seed, progress=shown)
         if config.least_steps:
             _keep(config.least_steps, writer)

@@ -10,7 +10,7 @@ from astra_data.core.artifact import finished_folder
 from astra_data.core.config import Config, as_json, faults_of
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import base_method
-from astra_data.core.progress import CLOCKS, Progress, Stopwatch, silent
+from astra_data.core.progress import CLOCKS, Progress, Stopwatch, part, silent
 from astra_data.core.provenance import origin
 from astra_data.grounding.files import GROUNDING, check_step, fitted, load_grounding, save_grounding
 from astra_data.grounding.fit import Fitting, GroundConfig
@@ -19,6 +19,9 @@ from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.methods import is_of_package, method_named
 from astra_data.reports.artifacts import GAP, METRICS, Metrics
 from astra_data.robots.registry import task_named
+
+_FIT_SHARE = 0.95  # of the progress
+_DERIVED = ("updates", "window", "reward_shrinkage", "clearance_m", "failure_model_latent")  # from the data
 
 
 def ground(
@@ -58,7 +61,8 @@ def ground(
     settings_text = as_json(**named, seed=seed, ground=config, settings=settings)
     made_from = {"dataset": episodes.content_hash}
     with finished_folder(out, config=settings_text, made_from=made_from) as folder:
-        fitting = Fitting(world, config, settings, training, held_out, seed, device, folder, progress)
+        fit_progress = part(progress, 0.0, _FIT_SHARE)
+        fitting = Fitting(world, config, settings, training, held_out, seed, device, folder, fit_progress)
         stopwatch = Stopwatch()
         with chdir("."):  # code of the user's may leave it
             grounding, metrics = fitted(fit(fitting))
@@ -71,12 +75,16 @@ def ground(
                 f"the figures of fit: {faults_of(error)}: expected JSON values, such as those of value.tolist(), "
                 "None for what is not known, and other names than those of reports"
             ) from None
-        progress(1.0, "gap report")
+        progress(_FIT_SHARE, "gap report")
         save_grounding(folder / GROUNDING, grounding, episodes)
         written = load_grounding(folder / GROUNDING, device)  # what policies are trained in
         if not is_of_package(base_method(method)):
             check_step(world, grounding, written, held_out)
         gap = gap_report(world, written, held_out, seed=seed)
+        found = figures.get("failure_model")
+        known = figures | ({"failure_model_latent": found.get("latent")} if isinstance(found, dict) else {})
+        derived = {name: value for name in _DERIVED if isinstance(value := known.get(name), int | float)}
+        progress(1.0, ", ".join(f"{name} {value:.4g}" for name, value in derived.items()) or "fitted")
         spent = stopwatch.spent()
         figures |= spent | {clock: figures[clock] + spent[clock] - fit_end[clock] for clock in CLOCKS}
         (folder / METRICS).write_text(json.dumps(figures, indent=1))

@@ -152,13 +152,14 @@ def test_after_an_interruption_it_goes_on(
     with pytest.raises(Stopped):
         make(task, paired, out, progress=stop_after(20))
     assert not out.exists()
-    seen: list[float] = []
-    assert make(task, paired, out, progress=lambda fraction, _: seen.append(fraction)) == expected
-    assert seen[0] == 1.0  # the last ten updates only
+    seen: list[tuple[float, str]] = []
+    assert make(task, paired, out, progress=lambda *noted: seen.append(noted)) == expected
+    assert seen[0][0] == 0.95 and [share for share, _ in seen].count(1.0) == 1  # the last ten updates only
     told, whole = (json.loads((folder / "metrics.json").read_text()) for folder in (out, tmp_path / "whole"))
     assert told["epochs"] == whole["epochs"] and told["epochs"][0]["step"] == 10
     least = min(told["epochs"], key=lambda epoch: float(epoch["held_out_error"]))
     assert told["updates"] == least["step"]
+    assert seen[-1][1].startswith(f"updates {least['step']}, window 20, ")
 
 
 def test_methods_without_a_grounding_and_raw_datasets_are_refused(
