@@ -111,7 +111,7 @@ def _walked(folder: Path, episodes: int) -> tuple[list[tuple[Floats, list[float]
     found = [(tensors[tested][:episodes], evaluation.outcomes.success, DEPLOYED, "-")]
     if evaluation.simulated and "simulated.position" in tensors:
         found.append((tensors["simulated.position"][:episodes], evaluation.simulated.success, SIMULATED, "--"))
-    return found, tensors["goal"][:episodes]
+    return [one for one in found if one[0].shape[-1]], tensors["goal"][:episodes]  # abstract states may have no place
 
 
 def mismatch(_: Results, scene: Scene) -> Figure | None:

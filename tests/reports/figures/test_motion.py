@@ -45,7 +45,7 @@ def write(
     goal: NDArray[np.float64] | None = None,
     ball: bool = False,
     simulated: bool = True,
-    positions: int = 2,
+    positions: tuple[int, int] = (2, 2),
 ) -> None:
     folder = root / f"evaluate/{row}/seed_0"
     folder.mkdir(parents=True)
@@ -54,11 +54,11 @@ def write(
         **{measure: [0, 1, 1] for measure in ("failed", "wall_contact", "steps", "return")},
     }
     values = {"task": "t", "method": row, "seed": 0, "episodes": 3, "target": outcomes}
-    target = np.concatenate([paths(), paths() + 0.5], axis=-1) if ball else paths()[..., :positions]
+    target = np.concatenate([paths(), paths() + 0.5], axis=-1) if ball else paths()[..., : positions[0]]
     tensors = {"target.position": target, "goal": np.full((3, 2), -4.0) if goal is None else goal}
     if simulated:
         values["simulated"] = outcomes
-        tensors["simulated.position"] = paths()[..., :positions]
+        tensors["simulated.position"] = paths()[..., : positions[1]]
     (folder / "evaluation.json").write_text(json.dumps(values))
     save_file(tensors, folder / "trajectories.safetensors")
 
@@ -104,8 +104,12 @@ def test_without_a_maze_paths_are_drawn_where_they_lead(scene: Scene) -> None:
     # From -4 to 4 in x and at 4 in y, and a tenth around it.
     assert nas.get_xlim() == pytest.approx((-4.8, 4.8)) and nas.get_ylim() == pytest.approx((3.2, 4.8))
     assert not [line for line in astra.lines if line.get_marker() == "*"] and not astra.collections
-    write(scene.root, "rma", goal=np.zeros((3, 0)), positions=0)
-    assert trajectories(results("rma"), replace(scene, task=TASKS["humanoid-walker2d"])) is None
+    write(scene.root, "rma", goal=np.zeros((3, 0)), positions=(0, 0))
+    humanoid = replace(scene, task=TASKS["humanoid-walker2d"])
+    assert trajectories(results("rma"), humanoid) is None
+    write(scene.root, "iql", goal=np.zeros((3, 0)), positions=(2, 0))  # a target that walks, of joints in a simulator
+    (iql,) = drawn(trajectories(results("iql"), humanoid)).axes
+    assert [line.get_color() for line in iql.lines if line.get_linestyle() != "None"] == [DEPLOYED] * 3
     state = torch.tensor([[0.5, -0.25, 1.0, 0.0]])
     assert cart.task.objective.places(state).tolist() == [[0.5, -0.25]]
 
