@@ -3,7 +3,6 @@
 import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from inspect import signature
 from pathlib import Path
@@ -136,10 +135,9 @@ def _faults(method: Method) -> Iterator[str]:
 def _takes(function: Callable[..., object], given: Sequence[str]) -> bool:
     """Return whether `function` can be called with as many arguments; what is built in does not tell."""
     try:
-        with suppress(ValueError):
-            signature(function).bind(*given)
-    except TypeError:
-        return False
+        signature(function).bind(*given)
+    except (TypeError, ValueError) as error:
+        return isinstance(error, ValueError)
     return True
 
 
