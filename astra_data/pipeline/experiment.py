@@ -19,7 +19,7 @@ from astra_data.core.artifact import MANIFEST, read_manifest
 from astra_data.core.config import Config, did_you_mean, read_written, validated
 from astra_data.core.durable import begun_beside
 from astra_data.core.errors import AstraDataError, BadInputError, RecipeError
-from astra_data.core.naming import first_few, shortened, stage_of_key
+from astra_data.core.naming import base_method, first_few, shortened, stage_of_key
 from astra_data.dataset.columns import ABSTRACT_STATE, ACTION
 from astra_data.dataset.compare import lineage
 from astra_data.dataset.description import changed_values, read_description
@@ -159,17 +159,16 @@ class Experiment:
 
     def _changed_since(self, found: Results) -> str:
         """Return what of the settings of tested rows is other than in results."""
-        makers: set[str | None] = set()
+        makers: set[str] = set()
         for row in found.tested():
             with suppress(BadInputError):  # of a method that is no more
-                method = method_named(row)
-                makers |= {method.name, grounded_as(row), method.initial}
-        names = {method.table.name: name for name, method in METHODS.items() if method.table}
+                makers |= {*filter(None, (base_method(row), grounded_as(row), method_named(row).initial))}
+        tables_of = {METHODS[maker].table for maker in makers}
 
         def compared(settings: Mapping[str, Any]) -> dict[str, Any]:
             own, data = settings.get("user_methods") or {}, settings.get("data")
             own = {name: {**table, "method": None} for name, table in own.items() if name in makers}
-            asked = {*STAGES} - {"select", "report"} | {name for name, of in names.items() if of in makers}
+            asked = {*STAGES} - {"select", "report"} | {table.name for table in tables_of if table}
             tables = {name: table for name, table in settings.items() if name in asked}
             return {"data": data if data and is_address(data) else None} | tables | own
 
@@ -212,7 +211,9 @@ def _changes(before: Mapping[str, Any], now: Mapping[str, Any], recipe: Recipe) 
         if name == "code":
             texts += [f"{file} changed" for file, _, _ in changed_values(old or {}, new or {})]
             continue
-        if isinstance(old, dict) and isinstance(config := getattr(recipe, name, None), Config):
+        table = METHODS[name].table if name in METHODS else None  # several methods may read one
+        config = getattr(recipe, table.name if table else name, None)
+        if isinstance(old, dict) and isinstance(config, Config):
             old = {key: value for key, value in old.items() if key in type(config).model_fields}  # a key may be no more
             with suppress(RecipeError):
                 old = validated(old, type(config), name).model_dump(mode="json")
@@ -326,13 +327,16 @@ def _replaced(item: Item, experiment: Experiment, made_from: Mapping[str, str]) 
             # What was made of it since, and has its name, is no other.
             if known.isdisjoint(content_hash for *_, content_hash in lineage(named)):
                 return f"made from another dataset than {named.reference}"
-    for key in item.inputs:
+    read = {key: _digest(key, experiment) if experiment.has(key) else None for key in item.inputs}
+    for key, digest in read.items():
         # A choice is among the policies that the recipe has now.
         if item.key == "select" and key not in made_from:
             return f"made without {key}"
-        if experiment.has(key) and _digest(key, experiment) not in (None, *made_from.values()):
+        if digest not in (None, *made_from.values()):
             return f"made from another {key}"
-    return ""
+    # A test was in the reference of all rows, which may be another now that a row is no more.
+    others = [name for name, digest in made_from.items() if digest not in read.values()]
+    return f"made from another {others[0]}" if others and item.stage == "evaluate" and all(read.values()) else ""
 
 
 def _digest(key: str, experiment: Experiment) -> str | None:

@@ -381,12 +381,14 @@ def test_changes_are_told_key_by_key_new_keys_have_their_defaults_and_old_ones_d
         str(caught.value),
     )
     assert found, str(caught.value)
-    recipe.write_text(HEAD)
-    record = folder / f"made_with/{TRAIN}.json"
-    kept = json.loads(record.read_text())
-    del kept["train"]["tries"]
-    kept["train"]["gone"] = 1
-    record.write_text(json.dumps(kept))
+    recipe.write_text(HEAD.replace('"astra_plus"', '"behavior_cloning"'))
+    run(recipe, root=recipe.parent)
+    for row, table, key in (("behavior_cloning", "behavior_cloning", "temperature"), ("astra", "train", "tries")):
+        record = folder / f"made_with/train/{row}/seed_0.json"
+        kept = json.loads(record.read_text())
+        del kept[table][key]
+        kept[table]["gone"] = 1
+        record.write_text(json.dumps(kept))
     assert states(recipe) == {}
     record.write_text("[]")
     with pytest.raises(AstraDataError, match=r"seed_0\.json is not what a run writes: .*restore it"):
@@ -411,6 +413,10 @@ def test_rows_and_seeds_come_and_go_without_changing_others(recipe: Path, folder
     assert changed(recipe, HEAD.replace('"astra", "astra_plus"', '"astra", "direct_transfer"')) == []
     assert changed(recipe, HEAD.replace("[0]", "[1]")) == []
     assert changed(recipe, HEAD.replace("umaze", "long")) == ["align", "collect", "evaluate", "ground", "pair", "train"]
+    recipe.write_text(HEAD.replace('"astra_plus"', '"nas"'))
+    run(recipe, root=recipe.parent)
+    recipe.write_text(HEAD.replace(', "astra_plus"', ""))  # tested in what NAS grounds, which the page would not say
+    assert states(recipe) == {EVALUATE: ("stale", "made from another reference")}
 
 
 SWEEP = HEAD.replace('"astra", "astra_plus"', '"nas", "follower"').replace("[0]", "[0, 1]") + (
@@ -454,7 +460,8 @@ def test_a_report_is_added_to_what_is_published_beside_the_recipe(
     assert (asked["publish"], asked["published"]) == (place, [])
     settings = load_experiment(recipe, tmp_path).recipe.settings
     (place / "r").mkdir(parents=True)
-    (place / "r/results.json").write_text(results_json(results(line("astra", 0, success=0.0), settings=settings)))
+    lines = [line(row, 0, success=0.0) for row in ("astra", "target")]
+    (place / "r/results.json").write_text(results_json(results(*lines, settings=settings)))
     run_stage(recipe, "report", root=tmp_path, publish=True)
     assert stages.asked["report"]["published"] == [place / "r/results.json"]
     run_stage(recipe, "report", root=tmp_path)
@@ -462,6 +469,7 @@ def test_a_report_is_added_to_what_is_published_beside_the_recipe(
     for table in ("[report]\ntrajectory_episodes = 7\n", "[rma]\nextrinsics_size = 7\n"):
         recipe.write_text(text + table)
         assert load_experiment(recipe, tmp_path).published() == [place / "r/results.json"]
-    recipe.write_text(text + "[evaluate]\nepisodes = 7\n")
-    with pytest.raises(RecipeError, match=r"^evaluate \(episodes: 100, now 7\) changed .* since the results"):
-        run_stage(recipe, "report", root=tmp_path, publish=True)
+    for table, key, before in (("evaluate", "episodes", "100"), ("target", "num_envs", "none")):
+        recipe.write_text(text + f"[{table}]\n{key} = 7\n")
+        with pytest.raises(RecipeError, match=rf"^{table} \({key}: {before}, now 7\) changed .* since the results"):
+            run_stage(recipe, "report", root=tmp_path, publish=True)
