@@ -3,6 +3,7 @@
 import os
 import sys
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,7 +14,7 @@ from astra_data.core.errors import AstraDataError, BadInputError
 from astra_data.core.naming import RUNS, artifact_key, first_few
 
 if TYPE_CHECKING:
-    from astra_data.reports.choice import TrialsFile
+    from astra_data.reports.choice import Trials
 
 
 def run(
@@ -224,24 +225,21 @@ def select(
     from astra_data.reports.choice import FOLDER
 
     given: dict[str, Any] = {"rows": row or (), "judge": judge, "episodes": episodes}
-    tried: dict[str, Any] = {"field": field, "percent": percent}
-    if trials is not None and by_hand:  # a display would hide what a person is asked
-        given["progress"] = lambda _, note: typer.echo(note, err=True)
-        lines = [_chosen(choose_by_trials(run, trials, by_hand=_key, **tried, **given))]
-    else:
-        with shown("select") as given["progress"]:
-            if trials is not None:
-                lines = [_chosen(choose_by_trials(run, trials, **tried, **given))]
-            else:
-                judged, lines = rank(run, **given), []
-                for size in judged.percents:
-                    first, at = judged.ranked(size)[0], f" at {size} %" if size else ""
-                    reached = f"{first.lower:.2f} in the lower quartile of its judges"
-                    lines.append(f"chosen{at}: {first.row}, seed {first.seed}: {reached}")
+    tried: dict[str, Any] = {"by_hand": _key if by_hand else None, "field": field, "percent": percent}
+    spoken = nullcontext(lambda _, note: typer.echo(note, err=True))  # a display would hide what a person is asked
+    with spoken if by_hand else shown("select") as given["progress"]:
+        if trials is not None:
+            lines = [_chosen(choose_by_trials(run, trials, **tried, **given))]
+        else:
+            judged, lines = rank(run, **given), []
+            for size in judged.percents:
+                first, at = judged.ranked(size)[0], f" at {size} %" if size else ""
+                reached = f"{first.lower:.2f} in the lower quartile of its judges"
+                lines.append(f"chosen{at}: {first.row}, seed {first.seed}: {reached}")
     typer.echo("\n".join([*lines, f"written: {run / FOLDER / 'select.md'}"]))
 
 
-def _chosen(made: "TrialsFile") -> str:
+def _chosen(made: "Trials") -> str:
     if made.chosen is None or made.rate is None:
         return f"{made.spent} trials are made: fill in trials.csv beside the page, and run the same command again"
     from astra_data.reports.statistics import Estimate, interval
@@ -301,15 +299,13 @@ def collect(
     resume: Annotated[bool, typer.Option("--resume", help="Continue the same command after an interruption.")] = False,
 ) -> None:
     """Record episodes in the target environment."""
-    if task.endswith(".toml"):
-        arguments.refuse({**settings, "name": name, "out": out, "resume": resume or None}, "collect")
-        arguments.run_stage(Path(task), "collect", seeds=seeds, jobs=jobs, root=root)
+    own = {**settings, "name": name, "out": out, "resume": resume or None}
+    if arguments.of_recipe(task, "collect", own, seeds=seeds, jobs=jobs, root=root):
         return
-    seed = arguments.refuse_of_recipes("collect", seeds, jobs) or 0
     # Torch's idle threads would slow down the physics; it is not loaded yet.
     os.environ["OMP_NUM_THREADS"] = "1"
     with arguments.resumable("run the same command with --resume to continue"):
-        _make("collect", task, settings, seed=seed, out=out, name=name, resume=resume)
+        _make("collect", task, settings, seed=seeds[0] if seeds else 0, out=out, name=name, resume=resume)
 
 
 @arguments.with_settings("astra_data.pipeline.stages.pair:PairConfig")
@@ -327,11 +323,10 @@ def pair(
     out: arguments.Out = None,
 ) -> None:
     """Add the abstract simulator's next state, from the same state and action, to every step."""
-    if dataset.endswith(".toml"):
-        arguments.refuse({**settings, "simulator": simulator, "name": name, "out": out}, "pair")
-        arguments.run_stage(Path(dataset), "pair", seeds=seeds, jobs=jobs, root=root)
+    own = {**settings, "simulator": simulator, "name": name, "out": out}
+    if arguments.of_recipe(dataset, "pair", own, seeds=seeds, jobs=jobs, root=root):
         return
-    if seeds or jobs is not None:
+    if seeds:
         raise BadInputError("pair: with a dataset, leave out --seed and --jobs (these are for recipes)")
     if simulator is None:
         raise BadInputError("pair: expected --simulator: a task or path.py:MySimulator")

@@ -172,10 +172,15 @@ class DatasetFile(Artifact):
     content_hash: str
 
 
-def read_json[T: Artifact](model: type[T], path: Path) -> T:
+def read_json[T: WrittenPart](model: type[T], path: Path) -> T:
     """Read one of the files above; raise a BadInputError if it was altered or its stage wrote another."""
     check_intact(path)
     return read_written(model, path, by="its stage", advice="run that stage again")
+
+
+def found_json[T: WrittenPart](model: type[T], path: Path) -> T | None:
+    """Read one of them where it is there, else return None."""
+    return read_json(model, path) if path.is_file() else None
 
 
 def read_tensors(path: Path, names: tuple[str, ...]) -> dict[str, Floats]:

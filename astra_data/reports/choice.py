@@ -3,7 +3,6 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import ceil, log2
-from pathlib import Path
 from statistics import fmean
 
 import numpy as np
@@ -11,7 +10,7 @@ from pydantic import Field
 
 from astra_data.core.artifact import GROWING
 from astra_data.methods import method_title
-from astra_data.reports.artifacts import Artifact, WrittenPart, read_json
+from astra_data.reports.artifacts import Artifact, WrittenPart
 from astra_data.reports.blocks import Section, TableBlock, Text, markdown
 from astra_data.reports.statistics import LEAST_SEEDS, Estimate, interval, success_rate, summarize
 
@@ -79,7 +78,7 @@ class TrialRound(WrittenPart):
 
 
 class Trials(WrittenPart):
-    """The `trials` that may be spent on `field` candidates in the target, their rounds, and the one chosen."""
+    """trials.json: the `trials` that may be spent on `field` candidates in the target, their rounds, the one chosen."""
 
     trials: int
     field: int
@@ -103,22 +102,6 @@ class Trials(WrittenPart):
             return ""
         row, seed = self.chosen
         return f"**{method_title(row)}, seed {seed}**: success {interval(Estimate(*self.rate))}"
-
-
-class TrialsFile(Trials, Artifact):
-    """trials.json: the trials, and where they were made."""
-
-
-def read_trials(root: Path) -> TrialsFile | None:
-    """Read the trials in a run's folder; None if none were begun."""
-    path = root / FOLDER / TRIALS
-    return read_json(TrialsFile, path) if path.is_file() else None
-
-
-def read_judged(root: Path) -> "Judged | None":
-    """Read what the stage `select` left in a run's folder; None if it was not run."""
-    path = root / FOLDER / SELECTED
-    return read_json(Judged, path) if path.is_file() else None
 
 
 class Candidate(WrittenPart):

@@ -303,16 +303,14 @@ def _cost(results: Results, stage: str, row: str, clock: str) -> float | None:
 
 
 def _every_seed(results: Results) -> Iterator[Block]:
-    table, left_out = results.table, [one.measure for one in COLUMNS if not _is_shown(results, one)]
-    is_shown = ~table["measure"].isin(left_out)
-    found = table[(table["where"] == TESTED) & table["row"].isin(results.tested()) & is_shown]
-    wide = found.pivot_table(index=["row", "percent", "seed"], columns="measure", values="value", sort=False)
-    swept = results.is_swept
+    found = [line for line in results.lines if line.where == TESTED and line.row in results.rows]
+    left_out, swept = [one.measure for one in COLUMNS if not _is_shown(results, one)], results.is_swept
+    measures = dict.fromkeys(name for line in found for name in line.values if name not in left_out)
     lines = []
-    for row, percent, seed in sorted(wide.index, key=lambda key: results.rows.index(key[0])):
-        cells = ["-" if np.isnan(value) else f"{value:.4g}" for value in wide.loc[(row, percent, seed)]]
-        lines.append([method_title(row), *([f"{percent} %"] if swept else []), f"{seed}", *cells])
-    names = [str(name).replace("_", " ") for name in wide.columns]
+    for line in sorted(found, key=lambda line: results.rows.index(line.row)):
+        cells = [f"{line.values[name]:.4g}" if name in line.values else "-" for name in measures]
+        lines.append([method_title(line.row), *([f"{line.percent} %"] if swept else []), f"{line.seed}", *cells])
+    names = [name.replace("_", " ") for name in measures]
     yield TableBlock("", ["method", *(["size"] if swept else []), "seed", *names], lines, words=1 + swept)
 
 
@@ -328,7 +326,7 @@ def _provenance(results: Results) -> Iterator[Block]:
         texts = [f"{text} ({', '.join(dict.fromkeys(of))})" for text, of in stages.items()]
         items.append(f"{what}: {'; '.join(texts if len(stages) > 1 else stages)}.")
     if results.user_code:
-        digests = [f"{name} `{digest}`" for name, digest in results.user_code.items()]
+        digests = [f"{name} `{digest.replace(' and ', '` and `')}`" for name, digest in results.user_code.items()]
         items.append(f"User code: {', '.join(digests)}.")
     uses: dict[tuple[str, str, str], list[str]] = {}
     for one in results.datasets:

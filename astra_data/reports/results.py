@@ -125,16 +125,6 @@ class Results(Facts):
         return self.scores[0]
 
     @cached_property
-    def table(self) -> "pd.DataFrame":
-        """Return a line for each number: row, seed, percent, where, measure, value."""
-        import pandas as pd
-
-        return pd.DataFrame(
-            [(*line.key, measure, value) for line in self.lines for measure, value in line.values.items()],
-            columns=["row", "seed", "percent", "where", "measure", "value"],
-        )
-
-    @cached_property
     def percents(self) -> list[int]:
         """The sizes of the dataset with a tested method or, without any, with a grounding, ascending."""
         tested = {line.percent for line in self.lines if line.where == TESTED}
@@ -222,16 +212,16 @@ class Results(Facts):
 
     def predicted_failures(self) -> "dict[tuple[int, str, str], pd.DataFrame]":
         """Return the figures of predicted failures by size, grounding and part of it: name → seed → value."""
-        of = self.table[(self.table["where"] == "ground") & self.table["measure"].str.startswith("failures.")]
-        if of.empty:
-            return {}
-        names = of["measure"].str.split(".", n=2, expand=True)
-        of = of.assign(part=names[1], measure=names[2])
-        return {
-            key: group.pivot_table(index="measure", columns="seed", values="value", sort=False)
-            for key, group in of.groupby(["percent", "row", "part"], sort=False)
-            if group["measure"].str.startswith("auc").any()
-        }
+        import pandas as pd
+
+        found: dict[tuple[int, str, str], dict[int, dict[str, float]]] = {}
+        for line in self.lines:
+            for measure, value in line.values.items():
+                if line.where == "ground" and measure.startswith("failures."):
+                    _, part, name = measure.split(".", 2)
+                    found.setdefault((line.percent, line.row, part), {}).setdefault(line.seed, {})[name] = value
+        tables = {key: pd.DataFrame(of) for key, of in found.items()}
+        return {key: of for key, of in tables.items() if of.index.str.startswith("auc").any()}
 
     def failure_rates(self) -> dict[str, dict[str, Floats]]:
         """Return what predicts failures → grounding → predicted and observed rate and number of steps, (3, bins)."""
@@ -311,6 +301,9 @@ def merge(sources: Sequence[Results]) -> Results:
         for part in ("lines", "errors", "trainings")
     }
     candidates = {(one.row, one.seed, one.percent): one for of in judged for one in of.candidates}
+    code: dict[str, list[str]] = {}
+    for name, digests in (item for one in sources for item in one.user_code.items()):
+        code.setdefault(name, []).extend(digests.split(" and "))  # of code that changed in between
     return last.model_copy(
         update={
             "command": "\n".join(dict.fromkeys(line for one in sources for line in one.command.splitlines())),
@@ -318,7 +311,7 @@ def merge(sources: Sequence[Results]) -> Results:
             "judged": judged[-1].model_copy(update={"candidates": [*candidates.values()]}) if judged else None,
             "trials": next((one.trials for one in reversed(sources) if one.trials), None),
             "origins": merged_origins(origin for one in sources for origin in one.origins),
-            "user_code": {name: digest for one in sources for name, digest in one.user_code.items()},
+            "user_code": {name: " and ".join(dict.fromkeys(of)) for name, of in code.items()},
             "datasets": _datasets(sources),
             **parts,
         }
@@ -383,8 +376,8 @@ def elapsed_seconds(results: Results) -> float:
 
 def stage_seconds(results: Results, clock: str) -> dict[str, float]:
     """Return the time of each stage over all of its artifacts, by "wall_seconds" or "cpu_seconds"."""
-    of = results.table[results.table["measure"] == clock]
-    return {str(stage): float(total) for stage, total in of.groupby("where", sort=False)["value"].sum().items()}
+    known = [(line.where, line.values[clock]) for line in results.lines if clock in line.values]
+    return {stage: sum(seconds for of, seconds in known if of == stage) for stage, _ in known}
 
 
 def read_results(path: Path) -> Results:

@@ -16,7 +16,7 @@ from astra_data.core.provenance import origin
 from astra_data.dataset.format import DATASET_PATH
 from astra_data.methods import grounded_as, method_named
 from astra_data.reports import artifacts, results
-from astra_data.reports.choice import Judgment, read_judged, read_trials
+from astra_data.reports.choice import FOLDER, SELECTED, TRIALS, Judged, Judgment, Trials
 from astra_data.worlds.objective import SUCCESS, Score
 
 DATASET_STAGES = ("collect", "label", "augment", "pair", "subset")  # they write a dataset of each seed
@@ -82,8 +82,8 @@ class RunReader:
 
     def read[A: artifacts.Artifact](self, stage: str, owner: Owner, name: str, model: type[A]) -> A | None:
         """Read an artifact's file, and write down its origin and numbers; None where there is none."""
-        path = self.path(stage, owner, name)
-        return self.add(stage, owner, artifacts.read_json(model, path)) if path.is_file() else None
+        file = artifacts.found_json(model, self.path(stage, owner, name))
+        return file and self.add(stage, owner, file)
 
     def add[A: artifacts.Artifact](self, stage: str, owner: Owner, file: A) -> A:
         """Write down the origin and the numbers of a file."""
@@ -117,9 +117,9 @@ class RunReader:
     def grounding(self, owner: Owner) -> None:
         """Read times, R², predicted failures and open-loop errors on held-out episodes of a grounding."""
         self.read("ground", owner, artifacts.METRICS, artifacts.Metrics)
-        if not self.path("ground", owner, artifacts.GAP).is_file():
+        gap = artifacts.found_json(artifacts.Gap, self.path("ground", owner, artifacts.GAP))
+        if gap is None:
             return
-        gap = artifacts.read_json(artifacts.Gap, self.path("ground", owner, artifacts.GAP))
         for simulator, of in {"still": gap.still or {}, "raw": gap.raw, "grounded": gap.grounded}.items():
             for quantity, band in of.items():
                 given: dict[str, Any] = {"simulator": simulator, "quantity": quantity, "horizons": gap.horizons}
@@ -162,12 +162,12 @@ def read_run(
             version, content = file.dataset_version or "", file.dataset_hash
             uses.append(results.DatasetUse(stage="evaluate", seed=file.seed, version=version, content_hash=content))
     judgment = trials = None
-    if judged := read_judged(root):
+    if judged := artifacts.found_json(Judged, root / FOLDER / SELECTED):
         run.add("select", Owner("", seeds[0], None), judged)
         if known := [one for one in judged.candidates if one.row in rows and one.seed in seeds]:
             facts_of = judged.model_dump(include={"judge", "episodes", "shares_episodes"})
             judgment = Judgment(**facts_of, candidates=known)
-            if begun := read_trials(root):
+            if begun := artifacts.found_json(Trials, root / FOLDER / TRIALS):
                 tried = {key for round_ in begun.rounds for key in round_.candidates}
                 trials = begun if tried <= {(one.row, one.seed) for one in known} else None
     run.add("report", Owner("", 0, None), artifacts.Artifact.model_validate(origin()))

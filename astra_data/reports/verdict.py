@@ -197,7 +197,10 @@ def _limits(results: Results, worth: Mapping[str, Estimate], best: str) -> Itera
 
 
 def _seed(results: Results, row: str) -> int:
-    """Return the seed whose policy to deploy: the one that judges prefer, else the best one."""
+    """Return the seed whose policy to deploy: the one that trials in the target choose, judges prefer, or the best."""
     choice, scores = results.choice(), results.values(row, results.headline.measure)
+    tried = results.trials
+    if tried and tried.chosen and tried.chosen[0] == row and tried.percent in (None, results.largest):
+        return tried.chosen[1]
     preferred = [one.seed for one in choice.candidates if one.row == row] if choice else []
     return preferred[0] if preferred else max(scores, key=lambda seed: scores[seed])

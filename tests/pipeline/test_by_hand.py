@@ -8,7 +8,7 @@ from small_cart import LOGS_ALONE
 
 from astra_data import Column
 from astra_data.core.errors import BadInputError
-from astra_data.pipeline.by_hand import Sheet
+from astra_data.pipeline.selecting import Sheet
 
 TASK = replace(LOGS_ALONE, goal=Column("goal", size=1, names=("goal_x",), astra={"unit": ["m"]}))
 POLICIES = [("nas", 3), ("astra", 0)]

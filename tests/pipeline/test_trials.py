@@ -21,7 +21,7 @@ from astra_data.pipeline.recipe import recorded_settings
 from astra_data.pipeline.selecting import choose_by_trials, select
 from astra_data.pipeline.trained_policy import TrainedPolicy, trained_policy
 from astra_data.policies.running_policy import RunningPolicy
-from astra_data.reports.choice import TrialsFile, halve, standings
+from astra_data.reports.choice import Trials, halve, standings
 
 pytestmark = pytest.mark.usefixtures("quick_fits")
 
@@ -67,7 +67,7 @@ def test_trials_are_made_in_the_target(folder: Path) -> None:
     shown = CliRunner().invoke(app, ["select", str(folder), "--trials", "12"])
     assert shown.exit_code == 0, shown.output
     assert (folder / "select/notes.txt").read_text() == "battery" and (folder / "select").stat().st_ino == place
-    record = TrialsFile.model_validate_json((folder / "select/trials.json").read_text())
+    record = Trials.model_validate_json((folder / "select/trials.json").read_text())
     assert record.field == 4 and record.spent == 12 and record.percent is None
     assert [(of.trials, len(of.tried)) for of in record.rounds] == [(2, 4), (2, 2)]
     assert record.chosen is not None and record.chosen in record.rounds[-1].candidates
@@ -132,7 +132,7 @@ def test_an_interruption_costs_one_candidate_at_most(
         patch.setattr(module, "in_target", broken)
         with pytest.raises(KeyboardInterrupt):
             choose_by_trials(folder, 20, field=4)
-        found = TrialsFile.model_validate_json((folder / "select/trials.json").read_text())
+        found = Trials.model_validate_json((folder / "select/trials.json").read_text())
         assert found.spent == 6 and found.chosen is None
         assert "Not finished" in (folder / "select/select.md").read_text()
         broken.breaks_at = 0

@@ -18,14 +18,13 @@ from astra_data.reports.choice import (
     Choice,
     Judged,
     TrialRound,
-    TrialsFile,
+    Trials,
     Tried,
     advice,
     choice_of,
     halve,
     least_trials,
     posterior,
-    read_judged,
     select_page,
     standings,
     widest_field,
@@ -96,15 +95,11 @@ def test_the_target_has_no_say_in_the_ranking() -> None:
     assert orders[0] == orders[1] == [(row, seed) for row, seed, *_ in A + B]
 
 
-def test_what_the_stage_wrote_is_read(tmp_path: Path) -> None:
-    assert read_judged(tmp_path) is None
-    (tmp_path / "select").mkdir()
-    file = tmp_path / "select/select.json"
-    file.write_text(judged(*A).model_dump_json())
-    assert read_judged(tmp_path) == judged(*A)
+def test_a_choice_has_candidates(tmp_path: Path) -> None:
+    file = tmp_path / "select.json"
     file.write_text(json.dumps({"judge": "nas", "episodes": 5, "candidates": []}))
     with pytest.raises(BadInputError, match="candidates"):
-        read_judged(tmp_path)
+        read_json(Judged, file)
 
 
 CANDIDATES = [
@@ -118,12 +113,12 @@ FIRST = TrialRound(
     candidates=[("astra", 1), ("nas", 1)],
     tried=[Tried(row="astra", seed=1, success=[0, 1]), Tried(row="nas", seed=1, success=[1, 1])],
 )
-BEGUN = TrialsFile(trials=9, field=2, pseudo_trials=4, rounds=[FIRST])
+BEGUN = Trials(trials=9, field=2, pseudo_trials=4, rounds=[FIRST])
 
 
 def test_the_page_says_who_was_tried_how_often_with_what_success(tmp_path: Path) -> None:
     (tmp_path / TRIALS).write_text(BEGUN.model_dump_json())
-    assert read_json(TrialsFile, tmp_path / TRIALS) == BEGUN and BEGUN.spent == 4
+    assert read_json(Trials, tmp_path / TRIALS) == BEGUN and BEGUN.spent == 4
     assert "Trials in the target" not in select_page("cart", JUDGED)
     page = select_page("cart", JUDGED, BEGUN)
     ahead = "ASTRA, seed 1 is ahead, with a success of 0.50 [0.09, 0.91]. NAS, seed 1, with 1.00 [0.34, 1.00]"

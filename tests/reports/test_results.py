@@ -60,7 +60,6 @@ def test_numbers_are_found_by_method_place_and_size() -> None:
     assert (found.percents, found.seeds, found.tested()) == ([20, 100], [0, 1], ["astra"])
     summary = found.score_of("astra")
     assert summary and (summary.value, summary.seeds) == (0.75, 2) and found.summary("astra", "failed") is None
-    assert found.table[found.table["where"] == SIMULATED]["value"].tolist() == [0.25]
 
 
 def test_the_interval_of_a_score_stays_within_what_it_can_be() -> None:
@@ -96,10 +95,13 @@ def test_merging_loses_nothing_and_says_what_it_replaces() -> None:
         errors=[error("nas", 0, "raw", 1.0, 2.0)],
         judged=judged(0),
         command="run --seed 1\nrun --seed 0",
+        user_code={"task": "a"},
     )
     later = line("astra", 1, success=0.75), line("astra", 2, success=1.0)
-    second = results(*later, rows=("astra",), judged=judged(1), command="run --seed 2\nrun --seed 1")
+    more: dict[str, object] = {"judged": judged(1), "user_code": {"task": "b"}}
+    second = results(*later, rows=("astra",), command="run --seed 2\nrun --seed 1", **more)
     merged = merge([first, second])
+    assert merge([merged, first]).user_code == {"task": "a and b"}
     assert merged.judged and [one.seed for one in merged.judged.candidates] == [0, 1]
     assert merged.command.split("run --seed ")[1:] == ["1\n", "0\n", "2"]
     assert merged.rows == ("astra", "nas") and merged.values("astra", "success") == {0: 0.25, 1: 0.75, 2: 1.0}

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from astra_data.cli.app import app
 from astra_data.cli.recipes import show_made
-from astra_data.reports.choice import Candidate, Judgment
+from astra_data.reports.choice import Candidate, Judgment, Trials
 from astra_data.reports.results import SIMULATED, TESTED, Errors, Results, results_json
 from astra_data.reports.verdict import Verdict, verdict_of
 from astra_data.worlds.objective import SURVIVED_STEPS
@@ -168,6 +168,14 @@ def test_judges_choose_the_seed_and_without_a_target_the_method() -> None:
     assert "choose NAS, seed 0, with a predicted success of 0.90" in words(found)
     found = verdict_of(results(of, judged=judged, tested_in="simulators"))
     assert (found.row, found.seed) == ("nas", 0) and "predicted success 0.90" in found.text
+    for chosen, percent, seed in (
+        (("astra", 1), None, 1),
+        (("astra", 1), 20, 0),
+        (("nas", 0), None, 0),
+        (None, None, 0),
+    ):
+        tried = Trials(trials=4, field=2, pseudo_trials=4, percent=percent, chosen=chosen)
+        assert verdict_of(results(of, judged=judged, trials=tried)).seed == seed
     floor = dict.fromkeys((7, 8, 9), 0.2)
     both = [candidates[2], Candidate(row="direct_transfer", seed=0, success=floor)]
     other = [one.model_copy(update={"percent": 20, "success": dict.fromkeys((7, 8, 9), 0.1)}) for one in both]

@@ -15,7 +15,7 @@ from astra_data.methods import method_named
 from astra_data.reports.artifacts import EVALUATION
 from astra_data.reports.blocks import html, markdown
 from astra_data.reports.choice import FOLDER, SELECTED
-from astra_data.reports.results import Results, merge, read_results, replaced, results_json
+from astra_data.reports.results import merge, read_results, replaced, results_json
 from astra_data.reports.runs import Reported, read_run
 from astra_data.reports.verdict import verdict_of
 from astra_data.robots.registry import task_named
@@ -71,7 +71,11 @@ def report(
         stand_in=task.facts.get("stand_in"),
         timestep_s=task.timestep_s,
     )
-    found = _added_to(published, found)
+    earlier = [read_results(path) for path in published]
+    for path, one in zip(published, earlier, strict=True):
+        if changed := replaced(one, found):
+            _log.warning("%s: new results replace those of %s", path, "; ".join(changed))
+    found = merge([*earlier, found]) if earlier else found
     progress(0.5, f"{len(found.tested())} methods, {len(found.seeds)} seeds")
     scene = Scene(root, task, config.trajectory_methods, config.trajectory_episodes)
     images = drawn(found, scene)
@@ -93,12 +97,3 @@ def report(
     if publish is not None:
         write(publish / recipe.name, {name: image for name, image in images.items() if name in PUBLISHED})
     progress(1.0, verdict_of(found).text.replace("**", ""))
-
-
-def _added_to(published: Sequence[Path], found: Results) -> Results:
-    """Return results with those that are published, of which none is lost; warn where one is replaced."""
-    earlier = [read_results(path) for path in published]
-    for path, one in zip(published, earlier, strict=True):
-        if changed := replaced(one, found):
-            _log.warning("%s: new results replace those of %s", path, "; ".join(changed))
-    return merge([*earlier, found]) if earlier else found

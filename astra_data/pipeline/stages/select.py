@@ -42,7 +42,6 @@ class Entry:
 
     row: str
     seed: int
-    percent: int | None
     policy: str
     grounding: str | None
 
@@ -99,7 +98,7 @@ def benches(recipe: Reported, judge: str) -> list[Bench]:
         entries = []
         for row, seed in product(rows, recipe.seeds):
             grounding = artifact_key("ground", grounded_as(row), seed, size) if method_named(row).grounds else None
-            entries.append(Entry(row, seed, size, artifact_key("train", row, seed, size), grounding))
+            entries.append(Entry(row, seed, artifact_key("train", row, seed, size), grounding))
         found.append(Bench(size, tuple(entries), judges))
     return found
 
@@ -159,7 +158,7 @@ def select(recipe: Reported, config: SelectConfig = SelectConfig(), *, root: Pat
                     success[other] = known[read]
                     note = f"{entry.row}, seed {entry.seed}: {fmean(success.values()):.2f}"
                     progress((len(found) + number / len(others)) / total * 0.99, note)
-                found.append(Candidate(row=entry.row, seed=entry.seed, percent=entry.percent, success=success))
+                found.append(Candidate(row=entry.row, seed=entry.seed, percent=bench.percent, success=success))
         shares, made = recipe.settings.get("data") is not None, origin() | stopwatch.spent()
         judged = Judged(judge=judge, episodes=config.episodes, shares_episodes=shares, candidates=found, **made)
         begun.unlink()

@@ -12,7 +12,8 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, silent
 from astra_data.pipeline.stages.select import SelectConfig, benches, judge_of, select
 from astra_data.policies.episodes import judged_success
-from astra_data.reports.choice import Judged, read_judged
+from astra_data.reports.artifacts import read_json
+from astra_data.reports.choice import Judged
 from astra_data.reports.runs import Reported
 
 pytestmark = pytest.mark.usefixtures("quick_fits")
@@ -34,9 +35,7 @@ def reported(root: Path, **changes: Any) -> Reported:
 def judged(root: Path, recipe: Reported | None = None, progress: Progress = silent, **settings: Any) -> Judged:
     config = SelectConfig(**{"episodes": 5} | settings)
     select(recipe or reported(root), config, root=root, progress=progress)
-    found = read_judged(root)
-    assert found is not None
-    return found
+    return read_json(Judged, root / "select/select.json")
 
 
 def test_each_policy_is_judged_by_the_groundings_of_other_seeds(root: Path) -> None:
