@@ -155,14 +155,14 @@ def run_stage(recipe: Path, stage: str, **options: Any) -> Path:
     return folder
 
 
-def refuse(options: Mapping[str, object], stage: str, table: str | None = None) -> None:
-    """Refuse `options` that are given, since a recipe sets them itself."""
-    if given := [f"--{name.replace('_', '-')}" for name, value in options.items() if value is not None]:
-        raise BadInputError(f"{stage}: the recipe's [{table or stage}] sets this: leave out {', '.join(given)}")
-
-
-def refuse_of_recipes(command: str, seeds: Sequence[int] | None, jobs: int | None) -> int | None:
-    """Return the one seed that is given with a task or a dataset, if any."""
-    if len(seeds or ()) > 1 or jobs is not None:
-        raise BadInputError(f"{command}: give at most one --seed and no --jobs (these are for recipes)")
-    return seeds[0] if seeds else None
+def of_recipe(
+    place: str, stage: str, own: Mapping[str, object], *, seeds: Sequence[int] | None, table: str = "", **how: Any
+) -> bool:
+    """Run a stage of the recipe at `place`, if it is one, which sets the stage's `own` options itself."""
+    if place.endswith(".toml"):
+        if given := [f"--{name.replace('_', '-')}" for name, value in own.items() if value is not None]:
+            raise BadInputError(f"{stage}: the recipe's [{table or stage}] sets this: leave out {', '.join(given)}")
+        run_stage(Path(place), stage, seeds=seeds, **how)
+    elif len(seeds or ()) > 1 or how["jobs"] is not None:
+        raise BadInputError(f"{stage}: give at most one --seed and no --jobs (these are for recipes)")
+    return place.endswith(".toml")

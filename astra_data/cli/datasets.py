@@ -29,16 +29,14 @@ def subset(
 ) -> None:
     """Write a random subset; with the same seed, smaller subsets are contained in larger ones."""
     size: dict[str, Any] = {"episodes": episodes, "percent": percent, "of": of}
-    if dataset.endswith(".toml"):
-        arguments.refuse(size | {"name": name, "out": out}, "subset", "sweep")
-        arguments.run_stage(Path(dataset), "subset", seeds=seeds, jobs=jobs, root=root)
+    own = size | {"name": name, "out": out}
+    if arguments.of_recipe(dataset, "subset", own, table="sweep", seeds=seeds, jobs=jobs, root=root):
         return
-    seed = arguments.refuse_of_recipes("subset", seeds, jobs)
     from astra_data.dataset.edit import subset as write
     from astra_data.dataset.versions import open_dataset
 
     source = open_dataset(dataset)
-    _report(write(source, **size, seed=seed, name=name, out=out))
+    _report(write(source, **size, seed=seeds[0] if seeds else None, name=name, out=out))
 
 
 def merge(

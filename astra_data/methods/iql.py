@@ -260,8 +260,19 @@ def learn_from_episodes(training: Training) -> tuple[PolicyFile, dict[str, Any]]
         policy: Policy = ActorCritic(shape).to(training.device)
     else:
         policy = copy.deepcopy(training.initial.policy).requires_grad_(True)
-    curve = _optimize(Iql(policy, experience, config, seed=training.seed), training)
-    return training.learned(policy, None), curve
+    iql = Iql(policy, experience, config, seed=training.seed)
+    logbook = Logbook(training.folder / CHECKPOINT, iql.load_state_dict)
+    while not iql.done:
+        losses = iql.iterate()
+        if iql.updates % 10 == 0 or iql.done:
+            shown = "  ".join(f"{name.replace('_', ' ')} {value:.3f}" for name, value in losses.items())
+            note = f"{iql.updates / logbook.stopwatch.seconds:,.0f} updates/s  {shown}"
+            training.progress(iql.updates / iql.total_updates, note)
+        if iql.updates % _CHECKPOINT_EVERY == 0 or iql.done:
+            # No policy acts while learning from recorded episodes, so there is no success rate.
+            logbook.points.append({"steps": iql.updates, "success": None, **losses})
+            logbook.keep(iql.state_dict())
+    return training.learned(policy, None), {**logbook.stopwatch.spent(), "points": logbook.points}
 
 
 def clone_behavior(training: Training) -> tuple[PolicyFile, dict[str, Any]]:
@@ -296,23 +307,6 @@ def experience_of(task: Task, episodes: PairedEpisodes) -> Experience:
         terminated=episodes.terminated,
         lengths=episodes.lengths,
     )
-
-
-def _optimize(iql: Iql, training: Training) -> dict[str, Any]:
-    """Train to the end, resuming from the checkpoint in the folder if there is one; return the losses."""
-    logbook = Logbook(training.folder / CHECKPOINT, iql.load_state_dict)
-    points, stopwatch = logbook.points, logbook.stopwatch
-    while not iql.done:
-        losses = iql.iterate()
-        if iql.updates % 10 == 0 or iql.done:
-            shown = "  ".join(f"{name.replace('_', ' ')} {value:.3f}" for name, value in losses.items())
-            note = f"{iql.updates / stopwatch.seconds:,.0f} updates/s  {shown}"
-            training.progress(iql.updates / iql.total_updates, note)
-        if iql.updates % _CHECKPOINT_EVERY == 0 or iql.done:
-            # No policy acts while learning from recorded episodes, so there is no success rate.
-            points.append({"steps": iql.updates, "success": None, **losses})
-            logbook.keep(iql.state_dict())
-    return {**stopwatch.spent(), "points": points}
 
 
 IQL = Method(

@@ -12,9 +12,8 @@ from astra_data.grounding.files import GROUNDING, grounding_at
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.methods import method_named
 from astra_data.pipeline.plan import ARTIFACTS, plan, selected
-from astra_data.pipeline.recipe import Recipe
+from astra_data.pipeline.recipe import Recipe, add_all
 from astra_data.pipeline.trained_policy import check_seed, settings_of
-from astra_data.pipeline.user_code import add_all
 from astra_data.policies.learner import ActingPolicy
 from astra_data.policies.running_policy import PolicyFile
 from astra_data.policies.simulator_env import Simulation, SimulatorEnv

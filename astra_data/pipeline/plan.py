@@ -25,10 +25,9 @@ from astra_data.core.naming import artifact_key, base_method, reference_of
 from astra_data.io.hub.stores import is_address
 from astra_data.methods import grounded_as, method_named
 from astra_data.pipeline.executors import Item
-from astra_data.pipeline.recipe import Recipe
+from astra_data.pipeline.recipe import Recipe, digests_of
 from astra_data.pipeline.stages.registry import STAGES, Stage
 from astra_data.pipeline.stages.select import benches, judge_of
-from astra_data.pipeline.user_code import digests_of
 from astra_data.reports.runs import Reported, Selection
 from astra_data.robots.registry import task_named
 

@@ -34,9 +34,9 @@ from astra_data.pipeline.experiment import (
     to_make_again,
 )
 from astra_data.pipeline.plan import check_stage, plan, selected, stages_until
+from astra_data.pipeline.recipe import UserMethod, add_all, digests_of
 from astra_data.pipeline.shipped import is_shipped
 from astra_data.pipeline.stages.registry import STAGES
-from astra_data.pipeline.user_code import UserMethod, add_all, digests_of
 from astra_data.reports.artifacts import CURVE, EVALUATION, METRICS, Artifact, Evaluation, read_json
 from astra_data.reports.diagnosis import DIAGNOSIS, diagnosis_page
 from astra_data.reports.held_out import write_held_out

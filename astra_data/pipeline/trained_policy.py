@@ -16,8 +16,7 @@ from astra_data.dataset.reader import Dataset
 from astra_data.dataset.statistics import ranges
 from astra_data.grounding.files import GROUNDING, TARGET_ENCODER, grounding_at, load_target_encoder
 from astra_data.methods import grounded_as, method_named
-from astra_data.pipeline.recipe import recorded_settings
-from astra_data.pipeline.user_code import add_all, check_unchanged
+from astra_data.pipeline.recipe import add_all, check_unchanged, recorded_settings
 from astra_data.policies.running_policy import POLICY, PolicyFile, RunningPolicy, running
 from astra_data.robots.registry import task_named
 from astra_data.worlds.user_code import found_near

@@ -5,7 +5,7 @@ import pytest
 from typer.testing import CliRunner
 
 from astra_data.cli import app as cli
-from astra_data.cli.arguments import refuse
+from astra_data.cli.arguments import of_recipe
 from astra_data.cli.recipes import show_made
 from astra_data.core.errors import AstraDataError, BadInputError
 
@@ -146,6 +146,7 @@ def test_ctrl_c_says_how_to_go_on(recipe: Path, monkeypatch: pytest.MonkeyPatch)
 
 
 def test_options_that_a_recipe_sets_itself_are_refused() -> None:
-    refuse({"episodes": None}, "collect")
+    own = {"of": 3, "min_steps": 0, "name": None}
+    assert not of_recipe("walks", "subset", own, seeds=[1], jobs=None)
     with pytest.raises(BadInputError, match=r"\[sweep\] sets this: leave out --of, --min-steps$"):
-        refuse({"of": 3, "min_steps": 0, "name": None}, "subset", "sweep")
+        of_recipe("r.toml", "subset", own, table="sweep", seeds=None, jobs=2)

@@ -13,9 +13,9 @@ from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.core.naming import CODE
 from astra_data.pipeline.experiment import load_experiment
 from astra_data.pipeline.grounded_env import grounded
+from astra_data.pipeline.recipe import check_unchanged
 from astra_data.pipeline.run import check, run
 from astra_data.pipeline.trained_policy import load_policy, settings_of
-from astra_data.pipeline.user_code import check_unchanged
 from astra_data.robots import registry
 
 ROWS = ("ground", "train", "evaluate")

@@ -10,7 +10,7 @@ from astra_data.core.errors import RecipeError
 from astra_data.methods import METHODS
 from astra_data.pipeline import run
 from astra_data.pipeline.experiment import load_experiment
-from astra_data.pipeline.user_code import UserMethod, add_all, looked_up, with_offered
+from astra_data.pipeline.recipe import UserMethod, add_all, looked_up, with_offered
 from astra_data.reports.results import results_json
 
 EXAMPLES = Path(__file__).parents[2] / "recipes/examples/methods"

@@ -11,7 +11,6 @@ from small_cart import GIVEN, LOGS_ALONE, TASK, Rail, Reach
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, STATE, Column
 from astra_data.methods.follower import careful
-from astra_data.pipeline.stages.collect import WallWatch
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.commands import DrivenSimulator
 from astra_data.worlds.objective import Objective
@@ -48,7 +47,6 @@ def test_what_needs_a_maze_is_refused_where_there_is_none() -> None:
     assert ANT.maze is ANT.plane is U_MAZE
     asked: list[Callable[[], object]] = [
         lambda: WALKER.maze,
-        lambda: WallWatch(WALKER, 0.2),
         lambda: careful(WALKER, torch.zeros(1, 0)),
     ]
     for ask in asked:

@@ -48,31 +48,26 @@ _SAC_STEPS, _SAC_EPISODE_STEPS = 300_000, 500  # steps of the training; it stops
 MOST_STEPS = 10**10  # upper bound of the steps of a dataset; it would take terabytes
 
 
-class WallWatch:
-    """Predicts with the abstract simulator how close to walls commands lead within a second."""
-
-    def __init__(self, task: Task, clearance_m: float) -> None:
-        self.clearance_m, self._task, self._maze = clearance_m, task, task.maze
-
-    def clearance(self, state: Tensor, commands: Floats) -> Floats:
-        """Return the least clearance in m (B, K) if `commands` (B, K, A) are held from `state` (B, S)."""
-        task, (count, choices, _) = self._task, commands.shape
-        simulator = task.simulator(count * choices)
-        simulator.reset_to(task.abstraction(state).repeat_interleave(choices, dim=0))
-        action = torch.from_numpy(commands).float().flatten(0, 1)
-        nearest = np.full((count, choices), np.inf)
-        for _ in range(round(_FORESIGHT_S / task.timestep_s)):
-            position = simulator.step(action)[:, :2].double().numpy()
-            nearest = np.minimum(nearest, self._maze.clearance(position).reshape(count, choices))
-        return nearest
+def clearance(task: Task, state: Tensor, commands: Floats) -> Floats:
+    """Predict the least clearance in m (B, K) within a second of `commands` (B, K, A) held from `state` (B, S)."""
+    count, choices, _ = commands.shape
+    simulator = task.simulator(count * choices)
+    simulator.reset_to(task.abstraction(state).repeat_interleave(choices, dim=0))
+    action = torch.from_numpy(commands).float().flatten(0, 1)
+    nearest = np.full((count, choices), np.inf)
+    for _ in range(round(_FORESIGHT_S / task.timestep_s)):
+        position = simulator.step(action)[:, :2].double().numpy()
+        nearest = np.minimum(nearest, task.maze.clearance(position).reshape(count, choices))
+    return nearest
 
 
 class RandomCommands:
     """Commands from U[-1, 1] per axis, each held for a random number of steps."""
 
-    def __init__(self, action_size: int, hold_steps: tuple[int, int], watch: WallWatch | None = None) -> None:
-        """Hold commands (A,) for `hold_steps` (fewest, most), or until `watch` predicts a wall."""
-        self._size, self._hold_steps, self._watch = action_size, hold_steps, watch
+    def __init__(self, task: Task, hold_steps: tuple[int, int], clearance_m: float = 0.0) -> None:
+        """Hold commands (A,) for `hold_steps` (fewest, most), or until they lead closer to walls than `clearance_m`."""
+        self._task, self._hold_steps, self._clearance_m = task, hold_steps, clearance_m
+        self._size = task.objective.action_size
 
     def begin(self, count: int, seed: int) -> Act:
         """Begin new episodes of so many robots; return what acts in them."""
@@ -84,13 +79,12 @@ class RandomCommands:
     def act(self, state: Tensor, goal: Tensor) -> Tensor:
         """Return commands (B, A); goals are ignored, and so are states unless walls are watched for."""
         over = self._left == 0
-        if self._watch is not None:
-            over |= self._watch.clearance(state, self._command[:, None])[:, 0] < self._watch.clearance_m
+        if self._clearance_m:
+            over |= clearance(self._task, state, self._command[:, None])[:, 0] < self._clearance_m
         due = np.flatnonzero(over)
-        choices, chosen = self._proposed(due, 1 if self._watch is None else _CHOICES), np.zeros(len(due), dtype=int)
-        if self._watch is not None:  # the first that stays clear of walls, or the clearest
-            clearance = self._watch.clearance(state[due], choices)
-            chosen = clearance.clip(max=self._watch.clearance_m).argmax(axis=1)
+        choices, chosen = self._proposed(due, _CHOICES if self._clearance_m else 1), np.zeros(len(due), dtype=int)
+        if self._clearance_m:  # the first that stays clear of walls, or the clearest
+            chosen = clearance(self._task, state[due], choices).clip(max=self._clearance_m).argmax(axis=1)
         self._command[due] = choices[np.arange(len(due)), chosen]
         self._left[due] = self._times(len(due))
         self._left -= 1
@@ -381,9 +375,8 @@ def _behavior(
 ) -> tuple[Behavior, dict[str, Any]]:
     """Return the behavior and its metadata; a policy trained for it is stored in the dataset."""
     if commands := {"random": RandomCommands, "stress": StressCommands}.get(config.behavior):
-        watch = WallWatch(task, config.clearance_m) if config.clearance_m else None
         fewest, most = (max(1, round(seconds / task.timestep_s)) for seconds in config.hold_s)
-        return commands(task.objective.action_size, (fewest, most), watch).begin, {}
+        return commands(task, (fewest, most), config.clearance_m).begin, {}
     by = partial(suboptimal_by_sac, steps=_SAC_STEPS, episode_steps=_SAC_EPISODE_STEPS)
     if config.behavior == "suboptimal_ppo":
         by = partial(suboptimal_by_ppo, steps=config.ppo_steps)

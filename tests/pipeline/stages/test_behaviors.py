@@ -18,7 +18,7 @@ from astra_data.pipeline.stages import collect as suboptimal
 from astra_data.pipeline.stages.collect import (
     RandomCommands,
     StressCommands,
-    WallWatch,
+    clearance,
     record,
     suboptimal_by_ppo,
     suboptimal_by_sac,
@@ -55,18 +55,18 @@ def nearest(behavior: RandomCommands) -> float:
 
 def test_a_watch_foresees_the_clearance_of_a_second() -> None:
     toward, along = [0.0, 1.0], [1.0, 0.0]
-    clearance = WallWatch(TASK, 0.2).clearance(believed(STARTS[1:2]), np.array([[toward, along]]))
+    least = clearance(TASK, believed(STARTS[1:2]), np.array([[toward, along]]))
     # 0.25 m/s for five steps of 0.192 s, on a grid of 0.05 m.
-    assert clearance.shape == (1, 2) and clearance[0] == pytest.approx([0.5 - 0.24, 0.5], abs=0.051)
+    assert least.shape == (1, 2) and least[0] == pytest.approx([0.5 - 0.24, 0.5], abs=0.051)
 
 
 def test_commands_that_are_watched_keep_clear_of_walls() -> None:
-    assert nearest(RandomCommands(2, HOLD)) < 0.2
-    assert nearest(RandomCommands(2, HOLD, WallWatch(TASK, 0.25))) >= 0.25 - 1e-6
+    assert nearest(RandomCommands(TASK, HOLD)) < 0.2
+    assert nearest(RandomCommands(TASK, HOLD, 0.25)) >= 0.25 - 1e-6
 
 
 def test_a_robot_that_is_too_near_is_led_away() -> None:
-    act = RandomCommands(2, HOLD, WallWatch(TASK, 0.3)).begin(64, seed=0)
+    act = RandomCommands(TASK, HOLD, 0.3).begin(64, seed=0)
     near = torch.tensor([[0.0, 2.35]]).expand(64, 2)
     command = act(believed(near), torch.zeros(64, 2))
     assert float(command[:, 1].max()) < 0.0
@@ -74,14 +74,14 @@ def test_a_robot_that_is_too_near_is_led_away() -> None:
 
 def test_commands_are_held_and_repeat_with_the_seed() -> None:
     state = believed(torch.zeros(5, 2))
-    first, second = (RandomCommands(2, (4, 4)).begin(5, seed=1) for _ in range(2))
+    first, second = (RandomCommands(TASK, (4, 4)).begin(5, seed=1) for _ in range(2))
     commands = torch.stack([first(state, state[:, :2]) for _ in range(8)])
     assert torch.equal(commands, torch.stack([second(state, state[:, :2]) for _ in range(8)]))
     assert torch.equal(commands[:1].expand(4, 5, 2), commands[:4]) and not torch.equal(commands[3], commands[4])
 
 
 def test_stress_commands_are_at_the_bounds_and_half_of_them_reverse_the_one_before() -> None:
-    act = StressCommands(3, (1, 1)).begin(200, seed=0)
+    act = StressCommands(TASKS["nao-kick"], (1, 1)).begin(200, seed=0)
     commands = torch.stack([act(torch.zeros(200, 47), torch.zeros(200, 0)) for _ in range(20)])
     assert torch.allclose(commands.abs().amax(-1), torch.ones(20, 200)) and (commands[0] != 0).all()
     is_reversed = (commands[1:] == -commands[:-1]).all(-1)

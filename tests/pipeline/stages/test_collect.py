@@ -15,7 +15,7 @@ from astra_data.dataset.doctor.check import check
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.writer import StagedWriter
 from astra_data.pipeline.stages import collect as stage
-from astra_data.pipeline.stages.collect import CollectConfig, WallWatch, begin_drawing, collect, record
+from astra_data.pipeline.stages.collect import CollectConfig, begin_drawing, clearance, collect, record
 from astra_data.policies.running_policy import PolicyFile, running
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.task import Task
@@ -246,8 +246,7 @@ def test_commands_that_lead_to_walls_are_replaced_where_it_is_asked_for(task: st
         out = tmp_path / str(clearance_m)
         collect(task, TINY.model_copy(update=settings), out=out)
         columns = Dataset.open(out).columns([STATE, ACTION])
-        watch = WallWatch(TASKS[task], 1.0)
         commands = columns[ACTION][:, None].astype(np.float64)
-        near = watch.clearance(torch.from_numpy(columns[STATE]), commands) < 1.0
+        near = clearance(TASKS[task], torch.from_numpy(columns[STATE]), commands) < 1.0
         foreseen[clearance_m] = near.mean()
     assert foreseen[1.0] < 0.5 * foreseen[0.0]
