@@ -94,7 +94,7 @@ def trim(
     out: arguments.Out = None,
 ) -> None:
     """Write a dataset with shorter episodes, or without some of their steps."""
-    from astra_data.dataset.timing import trim as write
+    from astra_data.dataset.edit import trim as write
     from astra_data.dataset.versions import open_dataset
 
     source = open_dataset(dataset)
@@ -108,7 +108,7 @@ def resample(
     out: arguments.Out = None,
 ) -> None:
     """Write a dataset at another rate: commands held, states interpolated, times true."""
-    from astra_data.dataset.timing import resample as write
+    from astra_data.dataset.edit import resample as write
     from astra_data.dataset.versions import open_dataset
 
     _report(write(open_dataset(dataset), fps, name=name, out=out))
@@ -291,8 +291,7 @@ def log(
     other: Annotated[str | None, typer.Argument(metavar="[OTHER]", help="Show how this one differs from it.")] = None,
 ) -> None:
     """Show what a dataset was made from, as a tree; or how two differ: columns, episodes by uid, origin."""
-    from astra_data.dataset.compare import differences, lineage, tree_lines
-    from astra_data.dataset.versions import open_dataset
+    from astra_data.dataset.versions import differences, lineage, open_dataset, tree_lines
 
     first = open_dataset(dataset)
     if other is None:

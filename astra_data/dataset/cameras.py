@@ -8,7 +8,7 @@ with it, unless that is longer than `MOST_EXTRA_S`; then its frames are encoded 
 
 import io
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -22,17 +22,9 @@ from numpy.typing import NDArray
 from astra_data.core.durable import file_digest
 from astra_data.core.errors import BadInputError, CorruptDatasetError, in_short
 from astra_data.dataset import format as layout
+from astra_data.dataset import plain
 from astra_data.dataset.columns import EPISODE_INDEX, INDEX, Clip
-from astra_data.dataset.parquet import read_blocks
-from astra_data.dataset.plain import (
-    Run,
-    episodes_files,
-    is_data_path,
-    is_format_2,
-    read_footer,
-    read_object,
-    read_places,
-)
+from astra_data.dataset.format import read_blocks
 
 MOST_EXTRA_S = 1.0
 _ENCODERS = {"av1": "libsvtav1", "h264": "libx264", "hevc": "libx265"}
@@ -128,7 +120,7 @@ def _index(path: Path, digest: str | None, _changed_ns: int) -> _Index:
 
 def read_cameras(root: Path, info: Mapping[str, Any]) -> dict[str, Camera]:
     """Return the cameras of the LeRobot dataset in `root`, with the clips that its metadata tell."""
-    cameras, described = dict[str, Camera](), read_object(root / layout.DATASET_PATH)
+    cameras, described = dict[str, Camera](), plain.read_object(root / layout.DATASET_PATH)
     digests = {} if isinstance(described, str) else described.get("videos", {})
     features = info["features"] if isinstance(info.get("features"), Mapping) else {}
     for name, feature in features.items():
@@ -136,7 +128,7 @@ def read_cameras(root: Path, info: Mapping[str, Any]) -> dict[str, Camera]:
             continue
         known, clips, fault, rows = _of_video if kind == "video" else _of_images, dict[int, Clip](), "", 0
         try:
-            for number, clip in (_of_format_2 if is_format_2(root) else known)(root, info, name):
+            for number, clip in (_of_format_2 if plain.is_format_2(root) else known)(root, info, name):
                 digest = digests.get(clip.path.relative_to(root).as_posix())
                 clips.setdefault(number, replace(clip, digest=digest))
                 rows += 1
@@ -153,7 +145,7 @@ def read_cameras(root: Path, info: Mapping[str, Any]) -> dict[str, Camera]:
 def _rows(root: Path, names: Sequence[str], camera: str) -> Iterator[tuple[int, list[Any], dict[str, Any]]]:
     """Yield the number of each episode, its values `names`, and its statistics of a camera."""
     stored = {f"stats/{camera}/{key}": key for key in layout.STORED_STATISTICS}
-    for block in read_blocks(episodes_files(root), [EPISODE_INDEX, *names, *stored]):
+    for block in read_blocks(plain.episodes_files(root), [EPISODE_INDEX, *names, *stored]):
         for row in block.to_pylist():
             known = {key: row[name] for name, key in stored.items() if row.get(name) is not None}
             yield row[EPISODE_INDEX], [row[name] for name in names], known
@@ -174,7 +166,7 @@ def _of_video(root: Path, info: Mapping[str, Any], name: str) -> Iterator[tuple[
 
 def _video_pattern(info: Mapping[str, Any], name: str) -> str:
     pattern = str(info["video_path"]).replace("{video_key}", name)
-    if not is_data_path(pattern):
+    if not plain.is_data_path(pattern):
         raise ValueError(f"expected a video_path inside the folder, got {info['video_path']!r}")
     return pattern
 
@@ -182,7 +174,7 @@ def _video_pattern(info: Mapping[str, Any], name: str) -> str:
 def _of_images(root: Path, info: Mapping[str, Any], name: str) -> Iterator[tuple[int, Clip]]:
     known = "length", "dataset_from_index", "data/chunk_index", "data/file_index"
     firsts: dict[Path, int] = {}
-    if not is_data_path(info["data_path"]):
+    if not plain.is_data_path(info["data_path"]):
         raise ValueError(f"expected a data_path inside the folder, got {info['data_path']!r}")
     for number, (length, first, chunk, file), statistics in _rows(root, known, name):
         path = root / info["data_path"].format(chunk_index=chunk, file_index=file)
@@ -190,7 +182,7 @@ def _of_images(root: Path, info: Mapping[str, Any], name: str) -> Iterator[tuple
 
 
 def _of_format_2(root: Path, info: Mapping[str, Any], name: str) -> Iterator[tuple[int, Clip]]:
-    for number, place in sorted(read_places(root, info)[0].items()):
+    for number, place in sorted(plain.read_places(root, info)[0].items()):
         if info["features"][name]["dtype"] == "image" and place.path:
             yield number, Clip(place.path, name, 0, 1, place.length)
             continue
@@ -199,7 +191,9 @@ def _of_format_2(root: Path, info: Mapping[str, Any], name: str) -> Iterator[tup
         yield number, Clip(path, name, 0, 1 / info["fps"], place.length)
 
 
-def clips_of_runs(root: Path, info: Mapping[str, Any], name: str, runs: Iterable[Run]) -> Iterator[tuple[int, Clip]]:
+def clips_of_runs(
+    root: Path, info: Mapping[str, Any], name: str, runs: Iterable[plain.Run]
+) -> Iterator[tuple[int, Clip]]:
     """Yield the number and the clip of each episode of `runs`, by its rows.
 
     Images are in its rows; videos, one after another, have a frame of each row that LeRobot recorded, or tell nothing.
@@ -234,7 +228,7 @@ def clip_fault(clip: Clip) -> str | None:
 
 def images(clip: Clip) -> list[dict[str, Any]]:
     """Return the stored images of a clip in a parquet file, its bytes, of which there are some, and path each."""
-    rows, footer = np.rint(clip.start + np.arange(clip.count) * clip.step).astype(int), read_footer(clip.path)
+    rows, footer = np.rint(clip.start + np.arange(clip.count) * clip.step).astype(int), plain.read_footer(clip.path)
     if isinstance(footer, str) or footer[0] <= rows[-1] or clip.camera not in footer[1].names:
         fault = footer if isinstance(footer, str) else f"has no images of {clip.camera} up to row {rows[-1]}"
         raise CorruptDatasetError(f"{clip.path} {fault}")
@@ -294,10 +288,10 @@ def _decode(clip: Clip) -> Iterator[Any]:
 
 
 class ClipWriter:
-    """Writes clips of one camera, one after another, to the MP4 files that `place` names by their numbers."""
+    """Writes clips of the camera `name`, one after another, to the MP4 files of the dataset in `root`."""
 
-    def __init__(self, place: Callable[[int], Path], fps: int) -> None:
-        self._place, self._fps = place, fps
+    def __init__(self, root: Path, name: str, fps: int) -> None:
+        self._root, self._name, self._fps = root, name, fps
         self._file, self._time_s, self._bytes = -1, 0.0, 0
         self._output: Any = None
         self._stream: Any = None
@@ -369,7 +363,8 @@ class ClipWriter:
 
         self.close()
         self._file += 1
-        path = self._place(self._file)
+        chunk, file = divmod(self._file, layout.CHUNK_SIZE)
+        path = self._root / layout.VIDEO_PATH.format(video_key=self._name, chunk_index=chunk, file_index=file)
         path.parent.mkdir(parents=True, exist_ok=True)
         self._output, self._stream, self._kind = av.open(str(path), "w"), None, kind
         self._time_s, self._bytes = 0.0, 0

@@ -85,20 +85,16 @@ def shortest(steps: Floats, turns: Floats) -> Floats:
     return left
 
 
-def continuity(episodes: Iterable[Episode]) -> list[Finding]:
-    """Tell of how many steps the next state is not the state of the row after it, to the bit."""
-    return _of_torn({episode.uid: _torn(episode) for episode in episodes})
-
-
-def _torn(episode: Episode) -> tuple[int, int]:
-    """Return of how many steps of an episode that is so, and of how many it could be."""
+def torn_steps(episode: Episode) -> tuple[int, int]:
+    """Return of how many steps the next state is not the state of the row after it, and of how many it could be."""
     state, arrived = as_rows(episode.columns[STATE]), as_rows(episode.columns[NEXT_STATE])
     return int((arrived[:-1] != state[1:]).any(axis=1).sum()), len(state) - 1
 
 
-def _of_torn(torn: Mapping[int, tuple[int, int]]) -> list[Finding]:
-    uids = tuple(uid for uid, (count, _) in torn.items() if count)
-    broken, steps = (sum(counts) for counts in zip(*torn.values(), strict=True))
+def continuity(counts: Mapping[int, tuple[int, int]]) -> list[Finding]:
+    """Tell of the `torn_steps` of each episode, by its uid, if there are any."""
+    uids = tuple(uid for uid, (count, _) in counts.items() if count)
+    broken, steps = (sum(each) for each in zip(*counts.values(), strict=True))
     what = f"steps whose {NEXT_STATE} is not the state of the next row: {broken} of {steps}"
     advice = (
         "rows are missing, or the columns come from different logs: import again, without "
@@ -254,9 +250,19 @@ def check_up(dataset: Dataset, called: str | None = None) -> Checkup:
     fps, uids = int(dataset.info["fps"]), dataset.uids.tolist()
     columns = {column.name: column for column in dataset.schema}
     clocks = [Clock.of(column, fps) for column in columns.values() if is_clock(column)]
-    for clock in clocks:
-        for episode in dataset.episodes([clock.name]):
+    doubled, apart, motions = list[tuple[int, int]](), dict[int, tuple[int, int]](), list[_Motion]()
+    ended: list[bool] = []
+    looked_at = [name for name in (STATE, NEXT_STATE, TERMINATED) if name in columns]
+    for episode in dataset.episodes([*looked_at, *(clock.name for clock in clocks)]):
+        for clock in clocks:
             clock.add(episode)
+        if TERMINATED in columns:
+            ended.append(bool(episode.columns[TERMINATED][-1]))
+        if STATE in columns:
+            state = as_rows(episode.columns[STATE])
+            doubled.append(repeated(state))
+            motions += [_motion(episode.uid, state)] if len(state) >= FEWEST_STEPS else []
+            apart |= {episode.uid: torn_steps(episode)} if NEXT_STATE in columns else {}
     # What the import said of rates and of rounding, where the dataset is one.
     notes, topics = (dataset.description.get(key) for key in ("notes", "topics"))
     noted = [*(notes if isinstance(notes, list) else []), *(topics if isinstance(topics, dict) else [])]
@@ -265,20 +271,12 @@ def check_up(dataset: Dataset, called: str | None = None) -> Checkup:
     found += [finding for clock in clocks for finding in clock.findings(called)]
     statistics = dataset.statistics()
     ranges = {name: np.array([statistics[name][key] for key in ("min", "max")], np.float64) for name in columns}
-    doubled, torn, motions = list[tuple[int, int]](), dict[int, tuple[int, int]](), list[_Motion]()
-    states = [name for name in (STATE, NEXT_STATE) if name in columns]
-    for episode in dataset.episodes(states) if STATE in columns else ():
-        state = as_rows(episode.columns[STATE])
-        doubled.append(repeated(state))
-        motions.append(_motion(episode.uid, state))
-        if NEXT_STATE in columns:
-            torn[episode.uid] = _torn(episode)
     if STATE in columns:
         found += repeats(doubled)
         both = dataset.episodes([STATE, ACTION]) if ACTION in columns else ()
         found += shift((as_rows(one.columns[STATE]), as_rows(one.columns[ACTION])) for one in both)
         found += large_angles(columns[STATE], np.abs(ranges[STATE]).max(axis=0))
-        found += _of_torn(torn) if torn else []
+        found += continuity(apart) if apart else []
     found += duplicates(dataset.digests, uids, called)
     # What is the same where episodes begin is not constant, where none goes on.
     if STATE in columns and dataset.lengths.max() > 1:
@@ -290,10 +288,7 @@ def check_up(dataset: Dataset, called: str | None = None) -> Checkup:
         actions = (as_rows(episode.columns[ACTION]) for episode in dataset.episodes([ACTION]))
         line, more = commands(columns[ACTION], actions, ranges[ACTION], fps)
         summary, found = [f"commands: {line}"], found + more
-    ended = None
-    if TERMINATED in columns:
-        ended = np.array([episode.columns[TERMINATED][-1] for episode in dataset.episodes([TERMINATED])])
-    line, more = endings(uids, dataset.lengths, ended, dataset.successes())
+    line, more = endings(uids, dataset.lengths, np.array(ended) if ended else None, dataset.successes())
     found = sorted(found + more, key=lambda finding: finding.severity != "warning")
     rates = [str(clock) for clock in clocks] or [f"{fps} Hz declared; no time column to compare it with"]
     summary = [f"endings: {line}", *summary, *(f"rate: {rate}" for rate in rates)]
@@ -359,32 +354,28 @@ def constant(column: Column, extremes: Floats) -> list[Finding]:
     return [Finding("note", what, f"{why}, or leave it out of the mapping")]
 
 
-_Motion = tuple[int, tuple[Floats, Floats, Floats, bool] | None]
-"""Uid of an episode and, if it is long enough, its longest rests (S,) as a share of its steps, the extremes (S,) of its
-values, and whether most steps move."""
+_Motion = tuple[int, Floats, Floats, Floats, bool]
+"""Uid of an episode, its longest rests (S,) as a share of its steps, the extremes (S,) of its values, and whether most
+steps move."""
 
 
-def stuck(column: Column, motions: Iterable[_Motion], called: str) -> list[Finding]:
+def stuck(column: Column, motions: Sequence[_Motion], called: str) -> list[Finding]:
     """Tell which values rest in some episodes and move in most."""
-    long = [(uid, values) for uid, values in motions if values]
-    if not long:
+    if not motions:
         return []
-    uids, measured = zip(*long, strict=True)
-    rests, lows, highs, others_move = (np.array(part) for part in zip(*measured, strict=True))
+    uids, rests, lows, highs, others_move = (np.array(part) for part in zip(*motions, strict=True))
     spans, whole = highs - lows, highs.max(axis=0) - lows.min(axis=0)
     moves = np.mean((rests < MOVING) & (spans > SMALLEST_SPAN * whole), axis=0) > MOST
     found = (rests > STUCK) & others_move[:, None] & moves
-    indices, where = np.flatnonzero(found.any(axis=0)).tolist(), np.array(uids)[found.any(axis=1)].tolist()
+    indices, where = np.flatnonzero(found.any(axis=0)).tolist(), uids[found.any(axis=1)].tolist()
     what = f"stuck for over half of an episode while others move: {channels(column, indices)}"
     return [Finding("warning", what, f"leave them out: {deletion(called, where)}", tuple(where))] if where else []
 
 
 def _motion(uid: int, state: Array) -> _Motion:
-    if len(state) < FEWEST_STEPS:
-        return uid, None
     changes = state[1:] != state[:-1]
     low, high = (extreme.astype(np.float64) for extreme in (state.min(axis=0), state.max(axis=0)))
-    return uid, (longest_rests(changes) / len(changes), low, high, bool(changes.any(axis=1).mean() > STUCK))
+    return uid, longest_rests(changes) / len(changes), low, high, bool(changes.any(axis=1).mean() > STUCK)
 
 
 def longest_rests(changes: Bools) -> Ints:

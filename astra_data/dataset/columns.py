@@ -37,6 +37,7 @@ EPISODE_INDEX, INDEX, TASK_INDEX = "episode_index", "index", "task_index"
 RESERVED = (EPISODE_UID, TIMESTAMP, FRAME_INDEX, EPISODE_INDEX, INDEX, TASK_INDEX)  # filled in by the writer
 DTYPES = ("float32", "int64", "bool")
 MOST_VALUES, MOST_NAME_BYTES = 2**20, 200  # of a column: values per step, and bytes of its name, which names files, too
+MOST_CHARACTERS = 2**20  # characters of a text in the metadata
 ROLES = {"position": 2, "vector": 2, "heading": 1, "quaternion": 4, "invariant": 1}
 """How a change of the planar frame acts on values (see `Column.astra`), and on how many of them at once."""
 Array = NDArray[Any]
@@ -225,11 +226,7 @@ class Episode:
             faults.append(f"columns differ in their number of steps ({listed})")
         elif not columns or 0 in lengths.values():
             faults.append("there are no steps" if columns else "there are no columns")
-        for key, value in metadata.items():
-            if not isinstance(value, Scalar):
-                faults.append(f"metadata {key}: {type(value).__name__}, expected float, int, bool or str")
-            elif isinstance(value, float) and not np.isfinite(value):
-                faults.append(f"metadata {key}: {value}, expected a finite number")
+        faults += [fault for key, value in metadata.items() for fault in _metadata_faults(key, value)]
         if faults:
             raise BadInputError(f"Episode {self.uid}: {'; '.join(faults)}.")
 
@@ -254,6 +251,26 @@ def _column_faults(name: str, values: Array) -> list[str]:
         where = f"frame {bad[0][0]}" + (f" index {bad[0][1]}" if values.ndim == 2 else "")
         faults.append(f"{name}: {len(bad)} values are not finite, the first in {where}")
     return faults
+
+
+def is_text(value: str) -> bool:
+    """Return whether `value` can be written as UTF-8; names of files that are not UTF-8 cannot."""
+    return not any("\ud800" <= character <= "\udfff" for character in value)
+
+
+def _metadata_faults(key: object, value: object) -> Iterator[str]:
+    if not isinstance(key, str) or not is_text(key) or not 0 < len(key) <= MOST_CHARACTERS:
+        yield f"metadata {key!r:.80}: expected a text of valid characters as its name"
+    elif not isinstance(value, Scalar):
+        yield f"metadata {key}: {type(value).__name__}, expected float, int, bool or str"
+    elif isinstance(value, float) and not np.isfinite(value):
+        yield f"metadata {key}: {value}, expected a finite number"
+    elif isinstance(value, int) and not -(2**63) <= value < 2**63:
+        yield f"metadata {key}: an integer of more than 64 bits"
+    elif isinstance(value, str) and len(value) > MOST_CHARACTERS:
+        yield f"metadata {key}: {len(value):,} characters, expected at most {MOST_CHARACTERS:,}"
+    elif isinstance(value, str) and not is_text(value):
+        yield f"metadata {key}: {value!r:.80} has characters that are not valid Unicode"
 
 
 def in_blocks(episodes: Iterable[Episode], rows: int) -> Iterator[list[Episode]]:

@@ -18,7 +18,7 @@ from astra_data.core.errors import BadInputError, CorruptDatasetError, unmet
 from astra_data.core.provenance import origin
 from astra_data.dataset import format as layout
 from astra_data.dataset.columns import Array
-from astra_data.dataset.parquet import to_arrow, to_numpy
+from astra_data.dataset.format import to_arrow, to_numpy
 from astra_data.dataset.plain import episodes_files, read_object, read_small_table
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
@@ -132,19 +132,17 @@ def read_description(root: Path) -> dict[str, Any]:
     return found
 
 
-def altered_columns(columns: Mapping[str, Array], episode: int, digests: Digests) -> list[str]:
-    """Return which `columns` of one episode differ from their digests, as far as these are known."""
-    return [
+def alteration(columns: Mapping[str, Array], episode: int, digests: Digests, path: Path, row: int) -> str | None:
+    """Say which `columns` of an episode, from `row` of the file at `path` on, differ from their digests, if any do."""
+    altered = [
         name
         for name, values in columns.items()
         if name in digests and episode < len(digests[name]) and digest_of(values) != digests[name][episode]
     ]
-
-
-def alteration(columns: Sequence[str], path: Path, row: int, steps: int, episode: int) -> str:
-    """Say that `columns` were altered in an episode of `steps`, from `row` of the file at `path`."""
-    where = f"{'/'.join(path.parts[-3:])} rows {row} to {row + steps - 1}"
-    return f"{', '.join(columns)}: other values than were written in {where} (episode {episode})"
+    if not altered:
+        return None
+    where = f"{'/'.join(path.parts[-3:])} rows {row} to {row + len(columns[altered[0]]) - 1}"
+    return f"{', '.join(altered)}: other values than were written in {where} (episode {episode})"
 
 
 def write_digests(root: Path, digests: Mapping[str, ArrayLike]) -> None:

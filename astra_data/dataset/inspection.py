@@ -86,7 +86,10 @@ def inspect_dataset(dataset: Dataset) -> Inspection:
         spreads.append(Spread(column, low, high, mean, np.zeros((column.size, BINS), np.int64)))
     for block in dataset.blocks([column.name for column in dataset.schema]):
         for spread in spreads:
-            _count(spread, block[spread.column.name])
+            span = np.where(spread.high > spread.low, spread.high - spread.low, 1.0)
+            bins = (as_rows(block[spread.column.name]).astype(np.float64) - spread.low) / span * BINS
+            flat = np.clip(bins, 0, BINS - 1).astype(np.int64) + BINS * np.arange(spread.column.size)
+            spread.counts[:] += np.bincount(flat.ravel(), minlength=spread.counts.size).reshape(spread.counts.shape)
     return Inspection(
         reference=dataset.reference,
         fps=int(dataset.info["fps"]),
@@ -116,13 +119,6 @@ def visited(dataset: Dataset, role: str = "position") -> Map | None:
         x, y = cells.clip(0, [width - 1, height - 1]).astype(np.int64).T
         np.add.at(counts, (y, x), 1)
     return Map(counts, low, cell)
-
-
-def _count(spread: Spread, values: Array) -> None:
-    span = np.where(spread.high > spread.low, spread.high - spread.low, 1.0)
-    bins = (as_rows(values).astype(np.float64) - spread.low) / span * BINS
-    flat = np.clip(bins, 0, BINS - 1).astype(np.int64) + BINS * np.arange(spread.column.size)
-    spread.counts[:] += np.bincount(flat.ravel(), minlength=spread.counts.size).reshape(spread.counts.shape)
 
 
 def endings_of(dataset: Dataset) -> Endings:

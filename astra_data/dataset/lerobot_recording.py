@@ -20,9 +20,7 @@ from astra_data.dataset import plain
 from astra_data.dataset.cameras import Camera, read_cameras
 from astra_data.dataset.columns import Array, Column, Scalar
 from astra_data.dataset.description import ContentHash, Digests, complete_description, digest_of, permutation
-from astra_data.dataset.format import DEFAULT_COLUMNS, INFO_PATH, reserved_values
-from astra_data.dataset.parquet import UNREADABLE, open_parquet, read_blocks
-from astra_data.dataset.plain import MOST_FPS, PlainColumn, Run, data_files, plain_columns
+from astra_data.dataset.format import UNREADABLE, open_parquet, read_blocks
 
 RECORDED_TASK = "recorded.task_index"  # (T,) int64: LeRobot's task_index, where there are several tasks
 ENDS = (names.TERMINATED, names.TRUNCATED)
@@ -40,7 +38,7 @@ DTYPES = {"f": "float32", "i": "int64", "u": "int64", "b": "bool"}  # ours, by t
 class Rows:
     """How rows of an episode in the files become rows of ours."""
 
-    stored: Mapping[str, PlainColumn]  # the columns of numbers in the files
+    stored: Mapping[str, plain.PlainColumn]  # the columns of numbers in the files
     fps: int
 
     @property
@@ -48,7 +46,7 @@ class Rows:
         """Rows at the end of each episode that are left out: 1 where next states are derived, otherwise 0."""
         return 0 if names.NEXT_STATE in self.stored else 1
 
-    def values(self, specs: Iterable[Column], run: Run, episode: int, start: int, uid: int) -> dict[str, Array]:
+    def values(self, specs: Iterable[Column], run: plain.Run, episode: int, start: int, uid: int) -> dict[str, Array]:
         """Return the columns `specs` of one episode, (T,) or (T, size).
 
         If the row that is left out is terminated, the step before it is, and has its reward and its success or failure;
@@ -56,7 +54,7 @@ class Rows:
         """
         steps, stored = len(run) - self.dropped, run.columns
         found = {name: values[:steps] for name, values in stored.items()}
-        found |= reserved_values(steps, uid=uid, episode=episode, start=start, fps=self.fps)
+        found |= layout.reserved_values(steps, uid=uid, episode=episode, start=start, fps=self.fps)
         found[RECORDED_TASK] = stored[names.TASK_INDEX][:steps]
         is_terminated, is_done = ends_with(names.TERMINATED, run), ends_with(names.DONE, run)
         terminated, truncated = (found[name] != 0 if name in stored else np.zeros(steps, bool) for name in ENDS)
@@ -78,7 +76,7 @@ class Rows:
             return {spec.name: found[spec.name].astype(spec.dtype) for spec in specs}
 
 
-def ends_with(flag: str, run: Run) -> bool:
+def ends_with(flag: str, run: plain.Run) -> bool:
     """Whether the last row of an episode has this flag, (T,)."""
     return flag in run.columns and bool(run.columns[flag][-1])
 
@@ -119,7 +117,7 @@ def next_state_of(state: Column) -> Column:
 def stored_features(folder: Path, declared: object, notes: list[str]) -> dict[str, Any]:
     """Return the features `declared` with the types and sizes of the columns in the first file that can be read."""
     features, schema = dict(declared) if isinstance(declared, dict) else {}, pa.schema([])
-    for path in data_files(folder):
+    for path in plain.data_files(folder):
         with suppress(*UNREADABLE), open_parquet(path) as file:
             schema = file.schema_arrow
             break
@@ -127,37 +125,37 @@ def stored_features(folder: Path, declared: object, notes: list[str]) -> dict[st
         is_list = pa.types.is_fixed_size_list(one.type)
         kind, size = (one.type.value_type, one.type.list_size) if is_list else (one.type, 1)
         dtype, feature = {"double": "float64", "float": "float32"}.get(str(kind), str(kind)), features.get(one.name)
-        if not (stored := plain_columns({one.name: {"dtype": dtype, "shape": [size]}})[0]):
+        if not (stored := plain.plain_columns({one.name: {"dtype": dtype, "shape": [size]}})[0]):
             continue
         found = dict(feature) if isinstance(feature, dict) else {}
-        if plain_columns({one.name: feature})[0] != stored:
-            notes.append(f"{one.name} is {size} {dtype}, as stored: {INFO_PATH} has {feature!r:.80}")
+        if plain.plain_columns({one.name: feature})[0] != stored:
+            notes.append(f"{one.name} is {size} {dtype}, as stored: {layout.INFO_PATH} has {feature!r:.80}")
             found |= {"dtype": dtype, "shape": [size]}
         try:
             Column.from_feature(one.name, found | {"dtype": "float32", "names": None})
         except BadInputError as error:
-            notes.append(f"what {INFO_PATH} says of units and roles is left out: {error}")
+            notes.append(f"what {layout.INFO_PATH} says of units and roles is left out: {error}")
             found.pop("astra", None)
         features[one.name] = found
     return features
 
 
-def declared_columns(folder: Path, info: Mapping[str, Any]) -> tuple[list[PlainColumn], list[Column], int]:
+def declared_columns(folder: Path, info: Mapping[str, Any]) -> tuple[list[plain.PlainColumn], list[Column], int]:
     """Return from info.json the columns of numbers as stored, ours for their values, and the fps."""
     features, fps = info.get("features"), info.get("fps")
     features = features if isinstance(features, dict) else {}
-    columns = plain_columns(features)[0]
-    missing = sorted({c.name for c in DEFAULT_COLUMNS} - {c.name for c in columns})
+    columns = plain.plain_columns(features)[0]
+    missing = sorted({c.name for c in layout.DEFAULT_COLUMNS} - {c.name for c in columns})
     faults = [f"lacks the columns {', '.join(missing)}, which are LeRobot's own"] if missing else []
-    kinds = {column.name: "f" if column.dtype == "float32" else "iu" for column in DEFAULT_COLUMNS}
+    kinds = {column.name: "f" if column.dtype == "float32" else "iu" for column in layout.DEFAULT_COLUMNS}
     own = [column for column in columns if column.name in kinds]
     if strange := [c.name for c in own if c.size != 1 or np.dtype(c.dtype).kind not in kinds[c.name]]:
         faults.append(f"has no single number a step as {', '.join(strange)}")
-    rate = fps if isinstance(fps, int | float) and 1 <= fps < MOST_FPS and fps == int(fps) else 0
+    rate = fps if isinstance(fps, int | float) and 1 <= fps < plain.MOST_FPS and fps == int(fps) else 0
     if not rate:
         faults.append(f"has fps {fps!r}, expected a whole number of frames per second")
     if faults:
-        raise CorruptDatasetError(f"{folder}: {INFO_PATH} {' and '.join(faults)}")
+        raise CorruptDatasetError(f"{folder}: {layout.INFO_PATH} {' and '.join(faults)}")
     specs = []
     for column in columns:
         if column.name not in names.RESERVED:
@@ -167,16 +165,11 @@ def declared_columns(folder: Path, info: Mapping[str, Any]) -> tuple[list[PlainC
     return columns, specs, int(rate)
 
 
-def name_of(folder: Path) -> str:
-    """Return a valid name of a dataset, from that of its folder."""
-    name = re.sub(r"[^A-Za-z0-9._-]+|^[^A-Za-z0-9]+", "-", folder.resolve().name)
-    return name.lstrip("-._") or "repaired"
-
-
-def robot_of(info: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what info.json says of the robot, as the environment of a dataset of ours."""
-    robot = info.get("robot_type")
-    return {"robot_type": robot} if isinstance(robot, str) else {}
+def description_of(folder: Path, info: Mapping[str, Any], stage: str, config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the description of a dataset without one of ours: a valid name, from its folder's, and its robot."""
+    name, robot = re.sub(r"[^A-Za-z0-9._-]+|^[^A-Za-z0-9]+", "-", folder.resolve().name), info.get("robot_type")
+    environment = {"robot_type": robot} if isinstance(robot, str) else {}
+    return {"name": name.lstrip("-._") or "repaired", "stage": stage, "config": config, "environment": environment}
 
 
 def _labels(labels: object, size: int) -> list[str] | None:
@@ -228,14 +221,19 @@ def open_recording(root: Path) -> dict[str, Any]:
     if not kept:
         raise BadInputError(f"{root}, recorded by LeRobot, has no episode of two rows or more")
     found = read_cameras(root, info)
-    unread = {name: camera.fault for name, camera in found.items() if camera.fault}
-    cameras = {name: camera for name, camera in found.items() if not camera.fault}
-    others = sorted(info["features"].keys() - {*(spec.name for spec in specs), *names.RESERVED, *found})
-    _announce(root, rows, columns, episodes, others, unread)
+    shown = [(at, episode.steps) for at, episode in enumerate(episodes) if episode.steps]
+    cameras = {
+        name: Camera(camera.feature, dict(enumerate(camera.clips[at].part(0, steps) for at, steps in shown)))
+        for name, camera in found.items()
+        if not camera.fault
+    }
+    more = [f"{name} is left out: {camera.fault}" for name, camera in found.items() if camera.fault]
+    if others := sorted(info["features"].keys() - {*(spec.name for spec in specs), *names.RESERVED, *found}):
+        more.append(f"left out, because they are not lists of numbers: {', '.join(others)}")
+    _announce(root, rows, columns, episodes, more)
     uids, lengths = [episode.uid for episode in kept], np.array([episode.steps for episode in kept])
     positions = {uid: index for index, uid in enumerate(uids)}
-    described = {"codebase_version": layout.CODEBASE_VERSION}
-    description = {"name": name_of(root), "stage": "record", "config": described, "environment": robot_of(info)}
+    description = description_of(root, info, "record", {"codebase_version": layout.CODEBASE_VERSION})
     all_columns, frames = layout.stored_columns(columns), int(lengths.sum())
     return dict(
         root=root,
@@ -249,13 +247,7 @@ def open_recording(root: Path) -> dict[str, Any]:
         task=" / ".join(tasks[index] for index in sorted(tasks)),
         paths=plain.data_files(root),
         file_starts=np.zeros(1, dtype=np.int64),
-        cameras={
-            name: Camera(
-                camera.feature,
-                dict(enumerate(camera.clips[at].part(0, it.steps) for at, it in enumerate(episodes) if it.steps)),
-            )
-            for name, camera in cameras.items()
-        },
+        cameras=cameras,
         recorded=RecordedFiles(
             rows=rows,
             first_rows=np.array([episode.first_row for episode in kept]),
@@ -347,15 +339,8 @@ def left_out(rows: Rows, episodes: Sequence[Found]) -> list[str]:
     return parts
 
 
-def _announce(
-    root: Path,
-    rows: Rows,
-    columns: Sequence[Column],
-    episodes: Sequence[Found],
-    others: Sequence[str],
-    unread: Mapping[str, str],
-) -> None:
-    """Say in one line what is left out or rounded, and which ends are not those of episodes."""
+def _announce(root: Path, rows: Rows, columns: Sequence[Column], episodes: Sequence[Found], more: list[str]) -> None:
+    """Say in one line what is left out or rounded, and which ends are not those of episodes, and `more`."""
     parts = left_out(rows, episodes)
     if early := [episode.uid for episode in episodes if episode.is_done_early]:
         parts.append(
@@ -366,7 +351,4 @@ def _announce(
         stored = rows.stored.get(column.name)
         if stored and not np.can_cast(stored.dtype, column.dtype):
             parts.append(f"{column.name} is {column.dtype} here, recorded as {stored.dtype}")
-    parts += [f"{camera} is left out: {fault}" for camera, fault in unread.items()]
-    if others:
-        parts.append(f"left out, because they are not lists of numbers: {', '.join(others)}")
-    _log.warning("%s", f"{root}, recorded by LeRobot: {'; '.join(parts) or 'without our metadata'}")
+    _log.warning("%s", f"{root}, recorded by LeRobot: {'; '.join([*parts, *more]) or 'without our metadata'}")

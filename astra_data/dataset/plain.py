@@ -15,8 +15,8 @@ import pyarrow.parquet as pq
 from astra_data.core.errors import CorruptDatasetError, in_short
 from astra_data.dataset import columns as names
 from astra_data.dataset import format as layout
-from astra_data.dataset.columns import Array
-from astra_data.dataset.parquet import UNREADABLE, open_parquet, read_blocks, to_numpy
+from astra_data.dataset.columns import Array, Column
+from astra_data.dataset.format import UNREADABLE, open_parquet, read_blocks, to_numpy
 
 TIMESTAMP_TOLERANCE_S = 1e-4  # as LeRobot's own; what float32 cannot tell apart is allowed beside it
 EPISODES_AT_ONCE = 100  # rows of meta/episodes held in memory
@@ -35,22 +35,12 @@ _MOST_ROWS = 10**12
 _MOST_BYTES = 2**28  # of a file of metadata in JSON
 
 
-@dataclass(frozen=True)
-class PlainColumn:
+class PlainColumn(NamedTuple):
     """A column of numbers: any numpy `dtype`, `size` values per step."""
 
     name: str
     dtype: str
     size: int
-
-    @property
-    def arrow_type(self) -> pa.DataType:
-        """The type of one step: a scalar, or a list of fixed size."""
-        return layout.arrow_type(self.dtype, self.size)
-
-    def fits(self, kind: pa.DataType) -> bool:
-        """Return whether a file may store it as `kind`; LeRobot's merge writes lists of variable size."""
-        return bool(kind == self.arrow_type or (self.size > 1 and kind == pa.list_(self.arrow_type.value_type)))
 
 
 class Place(NamedTuple):
@@ -230,15 +220,11 @@ def episodes_files(root: Path) -> list[Path]:
 
 def episode_rows(root: Path, *, statistics: bool) -> Iterator[dict[str, Any]]:
     """Yield the rows of meta/episodes, with or without the episodes' statistics."""
-    for path in episodes_files(root):
-        try:
-            with open_parquet(path) as file:
-                # As Python objects, the statistics of an episode take tens of kilobytes.
-                kept = [name for name in file.schema_arrow.names if statistics or not name.startswith("stats/")]
-                for batch in file.iter_batches(EPISODES_AT_ONCE, columns=kept):
-                    yield from batch.to_pylist()
-        except UNREADABLE as error:
-            raise CorruptDatasetError(f"{path.name} cannot be read ({in_short(error)})") from error
+    for table in read_blocks(episodes_files(root)):
+        kept = [name for name in table.column_names if statistics or not name.startswith("stats/")]
+        # As Python objects, the statistics of an episode take tens of kilobytes.
+        for batch in table.select(kept).to_batches(EPISODES_AT_ONCE):
+            yield from batch.to_pylist()
 
 
 def runs(path: Path, tables: Iterator[pa.Table], columns: Sequence[PlainColumn]) -> Iterator[Run]:
@@ -260,14 +246,15 @@ def runs(path: Path, tables: Iterator[pa.Table], columns: Sequence[PlainColumn])
         yield Run(path, row, rest)
 
 
-def schema_faults(schema: pa.Schema, columns: Sequence[PlainColumn]) -> list[str]:
+def schema_faults(schema: pa.Schema, columns: Sequence[PlainColumn] | Sequence[Column]) -> list[str]:
     """List the columns that `schema` lacks or has as another type."""
     faults = [f"lacks column {column.name}" for column in columns if column.name not in schema.names]
-    return faults + [
-        f"has {column.name} as {schema.field(column.name).type}, expected {column.arrow_type}"
-        for column in columns
-        if column.name in schema.names and not column.fits(schema.field(column.name).type)
-    ]
+    for column in (column for column in columns if column.name in schema.names):
+        found, expected = schema.field(column.name).type, layout.arrow_type(column.dtype, column.size)
+        # LeRobot's merge writes lists of variable size.
+        if found != expected and (column.size == 1 or found != pa.list_(expected.value_type)):
+            faults.append(f"has {column.name} as {found}, expected {expected}")
+    return faults
 
 
 def block_values(table: pa.Table, columns: Sequence[PlainColumn]) -> dict[str, Array]:
@@ -277,7 +264,7 @@ def block_values(table: pa.Table, columns: Sequence[PlainColumn]) -> dict[str, A
         stored = table.column(column.name)
         try:
             if pa.types.is_list(stored.type):
-                stored = stored.cast(column.arrow_type)
+                stored = stored.cast(layout.arrow_type(column.dtype, column.size))
             values[column.name] = to_numpy(stored, column.size, column.dtype)
         except pa.ArrowInvalid as error:
             raise CorruptDatasetError(f"{column.name}: expected {column.size} values in every row") from error

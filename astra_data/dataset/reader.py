@@ -22,8 +22,8 @@ from astra_data.dataset import format as layout
 from astra_data.dataset import plain
 from astra_data.dataset.cameras import Camera, clip_fault, decoded, read_cameras
 from astra_data.dataset.columns import RESERVED, SUCCESS, Array, Column, Episode, Scalar
+from astra_data.dataset.format import BLOCK_VALUES, read_blocks, rows_of, to_numpy
 from astra_data.dataset.lerobot_recording import RecordedFiles, open_recording
-from astra_data.dataset.parquet import read_arrays, read_blocks, rows_of, to_numpy
 from astra_data.dataset.statistics import ranges
 
 if TYPE_CHECKING:
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 
-REPAIR = "astra-data repair {} --out DIR"  # the command that writes what is intact in a folder to another one
 _SHOWN = 4  # datasets of a run
 _LOCATION = ("length", "data/chunk_index", "data/file_index")
 
@@ -156,8 +155,7 @@ class Dataset:
         specs = self.schema if names is None else self.specs(names)
         for block, indices in self._verified(specs, self.selected(episodes)):
             for episode, columns in self._split(block, indices):
-                metadata = {key: values[episode] for key, values in self.metadata.items()}
-                known = {key: value for key, value in metadata.items() if value is not None}
+                known = {key: value for key, values in self.metadata.items() if (value := values[episode]) is not None}
                 clips = {name: camera.clips[episode] for name, camera in self.cameras.items()}
                 yield Episode(int(self.uids[episode]), columns, known, clips)
 
@@ -207,7 +205,7 @@ class Dataset:
         return sorted(order, key=lambda index: rank[int(self.recordings[index])])[:count]
 
     def statistics(self) -> dict[str, dict[str, Any]]:
-        """Return meta/stats.json, column to statistic to values; of a recording, min, max and mean.
+        """Return meta/stats.json, column to statistic to values; of a recording, without quantiles.
 
         As lerobot's, its quantiles are estimates, from those of the episodes.
         """
@@ -278,11 +276,11 @@ class Dataset:
     def alterations(self, block: Mapping[str, Array], indices: Ints) -> Iterator[str]:
         """Yield a sentence for each episode of a block that has other values than were written."""
         for episode, values in self._split(block, indices):
-            if altered := described.altered_columns(values, episode, self.digests):
-                start = int(self.starts[episode])
-                file = int(np.searchsorted(self.file_starts, start, side="right")) - 1
-                row = start - int(self.file_starts[file])
-                yield described.alteration(altered, self.paths[file], row, int(self.lengths[episode]), episode)
+            start = int(self.starts[episode])
+            file = int(np.searchsorted(self.file_starts, start, side="right")) - 1
+            row = start - int(self.file_starts[file])
+            if fault := described.alteration(values, episode, self.digests, self.paths[file], row):
+                yield fault
 
     def specs(self, names: Sequence[str]) -> list[Column]:
         """Return the columns `names`."""
@@ -338,8 +336,7 @@ def _parsed(root: Path, description: dict[str, Any]) -> dict[str, Any]:
             faults.append(f"{name} {footer}")
             continue
         faults += [f"{name} has {footer[0]} rows, expected {expected}"] if footer[0] != expected else []
-        stored = [plain.PlainColumn(column.name, column.dtype, column.size) for column in columns]
-        faults += [f"{name} {fault}" for fault in plain.schema_faults(footer[1], stored)]
+        faults += [f"{name} {fault}" for fault in plain.schema_faults(footer[1], columns)]
     tasks = plain.read_tasks(root)
     if isinstance(tasks, str) or 0 not in tasks:
         faults.append(f"{layout.TASKS_PATH} {tasks if isinstance(tasks, str) else 'has no task 0'}")
@@ -367,13 +364,15 @@ def read_values(dataset: Dataset, columns: Sequence[Column], episodes: Ints) -> 
     if not columns:
         return
     if dataset.recorded is not None:
-        yield from _converted(dataset, dataset.recorded, columns, episodes)
+        yield from _converted(dataset, columns, episodes)
         return
     wanted = rows_of(episodes, dataset.starts, dataset.lengths, int(dataset.lengths.sum()))
     ends = np.cumsum(dataset.lengths[episodes])
     rest: dict[str, Array] = {}
     row = first = 0
-    for block in read_arrays(dataset.paths, columns, wanted):
+    most = max(1, BLOCK_VALUES // sum(column.size for column in columns))
+    for table in read_blocks(dataset.paths, [column.name for column in columns], wanted, most):
+        block = {c.name: to_numpy(table.column(c.name), c.size, c.dtype) for c in columns}
         rest = {name: np.concatenate([rest[name], block[name]]) for name in block} if rest else block
         rows = len(rest[columns[0].name])
         last = int(np.searchsorted(ends, row + rows, side="right"))
@@ -386,11 +385,10 @@ def read_values(dataset: Dataset, columns: Sequence[Column], episodes: Ints) -> 
         raise CorruptDatasetError("the data files have other rows than when the dataset was opened")
 
 
-def _converted(
-    dataset: Dataset, recorded: RecordedFiles, columns: Sequence[Column], episodes: Ints
-) -> Iterator[tuple[dict[str, Array], Ints]]:
+def _converted(dataset: Dataset, columns: Sequence[Column], episodes: Ints) -> Iterator[tuple[dict[str, Array], Ints]]:
     """Yield what `read_values` does of a recording of LeRobot, an episode at a time."""
-    rows = recorded.rows
+    assert dataset.recorded is not None
+    recorded, rows = dataset.recorded, dataset.recorded.rows
     lengths = dataset.lengths + rows.dropped
     wanted = rows_of(episodes, recorded.first_rows, lengths, recorded.total_rows)
     stored = list(rows.stored.values())
@@ -405,10 +403,9 @@ def _converted(
 
 def refuse_others(root: Path) -> None:
     """Raise BadInputError where `root` holds no dataset, versions of one, or one of another format."""
-    refuse_versions(root)
+    refuse_folders(root)
     fault = format_fault(root)
     if not fault and not (root / "meta").is_dir():
-        refuse_run(root)
         logs = sorted(path.name for path in root.glob("*.[cC][sS][vV]"))
         fault = (
             f"{root} contains logs ({logs[0]} and so on): make them a dataset with `astra-data import` and a "
@@ -430,18 +427,15 @@ def format_fault(root: Path) -> str | None:
     found = f"{root} has LeRobot's format {version}, expected {layout.CODEBASE_VERSION}"
     if not plain.is_format_2(root):
         return f"{found}: convert it with a version of lerobot that reads both"
-    return f"{found}: convert it with lerobot's convert_dataset_v21_to_v30, or {REPAIR.format(root)}"
+    return f"{found}: convert it with lerobot's convert_dataset_v21_to_v30, or astra-data repair {root} --out DIR"
 
 
-def refuse_versions(root: Path) -> None:
-    """Raise BadInputError where `root` holds versions of a dataset; name them."""
+def refuse_folders(root: Path) -> None:
+    """Raise BadInputError where `root` holds versions of a dataset, or is the folder of a run; name its datasets."""
     if versions := sorted(path.name for path in root.glob("data-*.*.*") if (path / layout.INFO_PATH).is_file()):
         raise BadInputError(f"{root} contains versions of a dataset: name one of {', '.join(versions)}.")
 
-
-def refuse_run(root: Path) -> None:
-    """Raise BadInputError where `root` is the folder of a run; name the datasets in it."""
-    if not (root / RECORD).is_file():
+    if not (root / RECORD).is_file() or (root / "meta").is_dir():
         return
     places = ("*/seed_*", "*/percent_*/seed_*")
     found = sorted(info.parents[1] for place in places for info in root.glob(f"{place}/{layout.INFO_PATH}"))

@@ -5,7 +5,6 @@ import shutil
 from array import array
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,16 +17,14 @@ from astra_data.core.errors import AstraDataError, BadInputError, CorruptDataset
 from astra_data.dataset import columns as names
 from astra_data.dataset import description as described
 from astra_data.dataset import format as layout
-from astra_data.dataset import parquet
 from astra_data.dataset.cameras import ClipWriter, images
-from astra_data.dataset.columns import Column, Episode, Scalar
-from astra_data.dataset.parquet import to_arrow, to_numpy
+from astra_data.dataset.columns import Column, Episode, Scalar, is_text
+from astra_data.dataset.format import to_arrow, to_numpy
 from astra_data.dataset.plain import flag_faults, open_end_faults, read_object
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.statistics import EpisodeRows, episode_statistics, pooled
 
 _METADATA_TYPES = {bool: pa.bool_(), int: pa.int64(), float: pa.float64(), str: pa.string()}
-MOST_CHARACTERS = 2**20  # characters of a text in the metadata
 
 
 class DatasetWriter:
@@ -94,8 +91,8 @@ class DatasetWriter:
         self._cameras = dict(cameras or {})
         images_of = [name for name, feature in self._cameras.items() if feature["dtype"] == "image"]
         self._schema = layout.data_schema(self._stored, images_of)
-        self._most_rows = 1 if images_of else parquet.GROUP_ROWS  # of several episodes
-        self._group: list[dict[str, Any]] = []  # values or images of the episodes of the next row group
+        self._most_rows = 1 if images_of else layout.GROUP_ROWS  # of several episodes
+        self._group: list[pa.Table] = []  # the episodes of the next row group
         self._group_rows = 0
         self._fps, self._task, self._subset_seed = fps, task, subset_seed
         self._description = described.complete_description(description)
@@ -120,17 +117,17 @@ class DatasetWriter:
             self._folder = stack.enter_context(durable.atomic_folder(self.root))
             encodings = layout.data_encodings(self._stored)
             # As LeRobot's; zstd is smaller, and slower.
-            self._data = parquet.RotatingWriter(self._folder, layout.DATA_PATH, self._schema, encodings, "snappy")
+            self._data = layout.RotatingWriter(self._folder, layout.DATA_PATH, self._schema, encodings, "snappy")
             stack.callback(self._data.abandon)
             self._rows = EpisodeRows(self._folder, self._stored, self._task, self._cameras)
             self._clips = {
-                name: ClipWriter(partial(self._video, name), self._fps)
+                name: ClipWriter(self._folder, name, self._fps)
                 for name, feature in self._cameras.items()
                 if feature["dtype"] == "video"
             }
             for clips in self._clips.values():
                 stack.callback(clips.close)
-            stack.callback(self._rows.abandon)
+            stack.callback(self._rows.file.abandon)
             self._exit = stack.pop_all()
         self._is_open = True
         return self
@@ -169,7 +166,7 @@ class DatasetWriter:
             length, uid=episode.uid, episode=len(self._lengths), start=self._frames, fps=self._fps
         )
         values[names.TIMESTAMP] = values[names.TIMESTAMP].astype(np.float32)
-        held = {name: np.array(column) for name, column in values.items()} | {
+        held = {name: to_arrow(np.array(column)) for name, column in values.items()} | {
             name: pa.array(images(clip), layout.IMAGE)
             for name, clip in episode.cameras.items()
             if name in self._schema.names
@@ -178,7 +175,7 @@ class DatasetWriter:
         if self._group_rows + length > self._most_rows:
             self._write_group()
         chunk, file = self._data.locate()
-        self._group.append(held)
+        self._group.append(pa.table(held, schema=self._schema))
         self._group_rows += length
         for name, column in values.items():
             self._hash.update(name, column)
@@ -191,13 +188,7 @@ class DatasetWriter:
     def _write_group(self) -> None:
         """Write the episodes that are held as a row group; images are those of one."""
         if self._group:
-            arrays = [
-                self._group[0][field.name]
-                if field.type == layout.IMAGE
-                else to_arrow(np.concatenate([one[field.name] for one in self._group]))
-                for field in self._schema
-            ]
-            self._data.write(pa.Table.from_arrays(arrays, schema=self._schema))
+            self._data.write(pa.concat_tables(self._group).combine_chunks())
             self._group, self._group_rows = [], 0
 
     def _finish(self) -> None:
@@ -237,10 +228,6 @@ class DatasetWriter:
         if faults := Dataset.open(self._folder).verify():
             raise CorruptDatasetError(f"{self.root} was not written: {'; '.join(faults)}. Check the disk.")
 
-    def _video(self, name: str, number: int) -> Path:
-        chunk, file = divmod(number, layout.CHUNK_SIZE)
-        return self._folder / layout.VIDEO_PATH.format(video_key=name, chunk_index=chunk, file_index=file)
-
     def _write_json(self, path: str, content: Mapping[str, Any]) -> None:
         target = self._folder / path
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -261,15 +248,6 @@ class Admission:
         if not isinstance(episode, Episode):
             kind = type(episode).__name__
             raise BadInputError(f"expected an Episode, made with Episode(uid, columns), got a {kind}")
-        if faults := self._faults(episode):
-            raise BadInputError(f"Episode {episode.uid}: {'; '.join(faults)}.")
-
-    def keep(self, episode: Episode) -> None:
-        """Let those that follow be checked against `episode`, too."""
-        self._uids.add(episode.uid)
-        self.metadata_types |= {key: type(value) for key, value in episode.metadata.items()}
-
-    def _faults(self, episode: Episode) -> list[str]:
         faults = [f"{name}: missing" for name in self._columns if name not in episode.columns]
         if self._cameras and (differing := self._cameras ^ episode.cameras.keys()):
             faults.append(f"cameras: expected {', '.join(sorted(self._cameras))}, differing {', '.join(differing)}")
@@ -284,31 +262,21 @@ class Admission:
                 faults.append(f"metadata {key}: {found.__name__}, earlier episodes have {known.__name__}")
             if key in layout.METADATA_KEYS:
                 faults.append(f"metadata {key}: is filled in by the writer, leave it out")
-            faults += _metadata_faults(key, value)
         flags = {name: values for name, values in episode.columns.items() if values.dtype == bool}
         faults += [*flag_faults(flags), *open_end_faults(flags)]
         if episode.uid in self._uids:
             faults.append("an earlier episode has the same uid")
-        return faults
+        if faults:
+            raise BadInputError(f"Episode {episode.uid}: {'; '.join(faults)}.")
 
-
-def is_text(value: str) -> bool:
-    """Return whether `value` can be written as UTF-8; names of files that are not UTF-8 cannot."""
-    return not any("\ud800" <= character <= "\udfff" for character in value)
-
-
-def _metadata_faults(key: str, value: Scalar) -> Iterator[str]:
-    if not isinstance(key, str) or not is_text(key) or not 0 < len(key) <= MOST_CHARACTERS:
-        yield f"metadata {key!r:.80}: expected a text of valid characters as its name"
-    elif isinstance(value, int) and not -(2**63) <= value < 2**63:
-        yield f"metadata {key}: an integer of more than 64 bits"
-    elif isinstance(value, str) and len(value) > MOST_CHARACTERS:
-        yield f"metadata {key}: {len(value):,} characters, expected at most {MOST_CHARACTERS:,}"
-    elif isinstance(value, str) and not is_text(value):
-        yield f"metadata {key}: {value!r:.80} has characters that are not valid Unicode"
+    def keep(self, episode: Episode) -> None:
+        """Let those that follow be checked against `episode`, too."""
+        self._uids.add(episode.uid)
+        self.metadata_types |= {key: type(value) for key, value in episode.metadata.items()}
 
 
 _SETTINGS = "plan.json"
+_WRITTEN = ".written"  # the content hash of the dataset that the staged episodes become
 
 
 class StagedWriter:
@@ -402,6 +370,7 @@ class StagedWriter:
                     with self._keeping(), self._writer:
                         for position in sorted(self.staged):
                             self._writer.add(load_staged(self._path(position), self._columns))
+                        durable.write_file(self.folder / _WRITTEN, self._writer.content_hash)
                     is_written = True
             finally:
                 with suppress(OSError):  # what stays is recognized by the next call
@@ -458,23 +427,11 @@ class StagedWriter:
         return f"{len(self._paths())} episodes" if self._paths() else "an unfinished recording"
 
     def _is_written(self) -> bool:
-        """Return whether the dataset at `root` holds every staged episode, value for value."""
-        paths = self._paths()
+        """Return whether the dataset at `root` is the one that the staged episodes became."""
         try:
-            dataset = Dataset.open(self.root)
-            staged = {episode.uid: path for path in paths for episode in [load_staged(path, self._columns)]}
-            for stored in dataset.episodes([column.name for column in self._columns]) if staged else ():
-                if path := staged.pop(stored.uid, None):
-                    one = load_staged(path, self._columns)
-                    same = (np.array_equal(v, stored.columns[name]) for name, v in one.columns.items())
-                    if one.metadata != stored.metadata or not all(same):
-                        return False
-        except AstraDataError:
+            return (self.folder / _WRITTEN).read_text() == Dataset.open(self.root).content_hash
+        except (OSError, AstraDataError):
             return False
-        settings = read_object(self.folder / _SETTINGS)
-        before = settings.get("description") if isinstance(settings, dict) else None
-        described = before if isinstance(before, dict) else self._settings["description"]
-        return not staged and (bool(paths) or described.items() <= dataset.description.items())
 
     def _path(self, position: int) -> Path:
         return self.folder / f"{position:06d}.arrow"

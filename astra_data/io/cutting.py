@@ -17,7 +17,6 @@ from astra_data.dataset.checkup import Clock, full_turns, shortest
 from astra_data.dataset.columns import Array, Column, Scalar
 from astra_data.dataset.inspection import Endings, is_terminated
 from astra_data.dataset.lerobot_recording import DERIVED_FLAGS, next_state_of
-from astra_data.dataset.statistics import Rounding
 from astra_data.io.mapping import MAPPED_FLAGS, ColumnMapping, ImportMapping
 from astra_data.io.recording import Block
 
@@ -73,13 +72,77 @@ class Tally:
         return "; ".join(parts[:_SHOWN]) + (f" and {len(parts) - _SHOWN} more" if len(parts) > _SHOWN else "")
 
 
+_LARGE = 2**16  # numbers beyond it that float32 cannot hold are refused: times, and positions far from their origin
+_ROUNDED = 0.05  # mean error of a step, as a share of a typical step, from which on rounding is warned of ...
+_LOST = 0.5  # ... and from which on large numbers are refused
+_TYPICAL = 0.9  # quantile of the steps that is typical: robots often stand still, and their sensors do not
+_ENOUGH = 10  # fewer steps tell nothing of rounding
+_SAMPLES, _MOST_SAMPLES = 2**9, 2**15  # steps that are looked at in a block, and in all
+
+
+class Rounding:
+    """Compares the steps of a column's values (n, size) with those that float32 holds."""
+
+    def __init__(self, column: Column, offset: Sequence[float] = ()) -> None:
+        self._column, self._offset = column, offset
+        self._low, self._high = np.full(column.size, np.inf), np.full(column.size, -np.inf)
+        self._samples: list[Array] = []
+
+    def add(self, values: Array, held: Array) -> None:
+        """Look at consecutive rows, all finite."""
+        exact = values.astype(np.float64)
+        self._low = np.minimum(self._low, exact.min(axis=0, initial=np.inf))
+        self._high = np.maximum(self._high, exact.max(axis=0, initial=-np.inf))
+        rows = np.arange(0, len(exact) - 1, max(1, len(exact) // _SAMPLES))
+        whole = values.astype(np.int64) if values.dtype.kind in "iu" else exact  # larger integers are no float64
+        steps = np.asarray(whole[rows + 1] - whole[rows], np.float64)
+        errors = held[rows + 1].astype(np.float64) - held[rows] - steps
+        # Less is the noise of a computation with float64, if it is no count.
+        steps[(np.abs(steps) < 64 * np.spacing(np.abs(exact[rows]))) & (steps % 1 != 0)] = 0.0
+        self._samples.append(np.abs([steps, errors]))
+        if sum(part.shape[1] for part in self._samples) > _MOST_SAMPLES:
+            self._samples = [np.concatenate(self._samples, axis=1)[:, ::2]]
+
+    def found(self) -> tuple[str, bool] | None:
+        """Return a warning, and whether most steps are lost; None where all are held well enough."""
+        if not self._samples:
+            return None
+        steps, errors = np.concatenate(self._samples, axis=1)
+        lost, helps, coarse = False, True, []
+        offset = np.broadcast_to(self._offset or 0.0, self._column.size).tolist()
+        for entry, (low, high) in enumerate(zip(self._low.tolist(), self._high.tolist(), strict=True)):
+            moved = steps[:, entry] > 0
+            if moved.sum() < _ENOUGH:
+                continue
+            step = float(np.quantile(steps[moved, entry], _TYPICAL))
+            share = float(errors[moved, entry].mean()) / step
+            if share < _ROUNDED:
+                continue
+            largest = max(-low, high)
+            spacing = float(np.spacing(np.float32(largest)))
+            is_count = spacing <= 2 and step == round(step)
+            lost |= share >= _LOST and largest > _LARGE and not is_count
+            digit = 10.0 ** np.floor(np.log10(max(high - low, step)))
+            offset[entry] = round(offset[entry] - digit * round((low + high) / 2 / digit), 12)
+            helps &= float(np.spacing(np.float32(high - low))) / 3 < _ROUNDED * step
+            name = self._column.names[entry] if self._column.names else f"entry {entry}"
+            coarse.append(f"{name} (up to {largest:.6g}) in steps of {spacing:.2g}, but it moves by {step:.2g}")
+        if not coarse:
+            return None
+        listed = ", ".join(f"{one:.1f}" if one == round(one) else f"{one:.15g}" for one in offset)
+        advice = f"set offset = [{listed}]" if helps else "leave out what is a time"
+        if lost and helps:
+            advice += ', leave out what is a time, or store counts with dtype = "int64"'
+        return f"columns.{self._column.name}: float32 holds {'; '.join(coarse)}: {advice}", lost
+
+
 class Cutter:
     """Cuts consecutive blocks into episodes; `skip_bad` leaves out those with a value that is not finite."""
 
     def __init__(self, mapping: ImportMapping, *, skip_bad: bool = False) -> None:
         self.tally = Tally()
         self.columns: tuple[Column, ...] = ()  # of the dataset, including derived ones; known after the first block
-        self._mapping, self._skips = mapping, skip_bad and mapping.not_finite == "refuse"
+        self.mapping, self._skips = mapping, skip_bad and mapping.not_finite == "refuse"
         self._converted: dict[str, Column] = {}
         self._rounding: dict[str, Rounding] = {}
         self._clock = Clock(mapping.time or "", mapping.fps)
@@ -95,7 +158,7 @@ class Cutter:
             yield from self.cut()
             self._begins = "file" if is_apart else "source"
         columns, bad = self.convert(block)
-        n, mapping = len(block), self._mapping
+        n, mapping = len(block), self.mapping
         rejected = np.logical_or.reduce([np.zeros(n, bool), *bad.values()])
         self._count(block, bad, rejected)
         if is_apart or not self._parts or self._parts[-1].origin != block.origin:
@@ -133,14 +196,14 @@ class Cutter:
         # What is missing (NaN) is the same value again, as empty cells of CSV are.
         masks["field"][1:] = ((earlier != later) & ~((earlier != earlier) & (later != later))).any(axis=1)
         times = np.repeat(table["/time"][:, None], 3, axis=1)
-        times[~table["/finite"] & (self._mapping.not_finite == "drop"), 2] = np.nan
+        times[~table["/finite"] & (self.mapping.not_finite == "drop"), 2] = np.nan
         known = np.where(np.isfinite(times[:, 1:]), np.arange(n)[:, None], 0)
         times[:, 1:] = np.take_along_axis(times[:, 1:], np.maximum.accumulate(known), axis=0)
         # As recorded, held over rows without a time, and held over rows that are dropped, too.
         steps_s = np.diff(times, axis=0, prepend=np.full((1, 3), np.nan))
         masks["back"] = steps_s[:, 1] < 0
-        masks["gap"] = np.asarray((steps_s[:, 1:] > (self._mapping.split.gap_s or np.inf)).any(axis=1))
-        masks["rejected"] = table["/torn"] | (~table["/finite"] & (self._mapping.not_finite == "split"))
+        masks["gap"] = np.asarray((steps_s[:, 1:] > (self.mapping.split.gap_s or np.inf)).any(axis=1))
+        masks["rejected"] = table["/torn"] | (~table["/finite"] & (self.mapping.not_finite == "split"))
         jumps = np.zeros(n, bool)
         jumps[kept] = self._jumped(table, kept)
         self._count_time(table, steps_s, masks["field"] | masks["end"] | masks["gap"] | jumps)
@@ -181,7 +244,7 @@ class Cutter:
             yield from self._episode(values, source | {"source_row": int(table["/row"][part[0]])})
 
     def _jumped(self, table: Table, kept: Ints) -> Bools:
-        jump = self._mapping.split.jump
+        jump = self.mapping.split.jump
         if not jump:
             return np.zeros(len(kept), bool)
         [column] = (column for column in self.columns if column.name == jump.column)
@@ -202,7 +265,7 @@ class Cutter:
         if block.torn:
             tally.torn_rows += block.torn
             tally.torn_first = tally.torn_first or block.row_name(block.row + len(block))
-        known = {*self._mapping.all_fields, *tally.unused_fields}
+        known = {*self.mapping.all_fields, *tally.unused_fields}
         tally.unused_fields += [name for name in block.known if name not in known]
         for note in block.notes:
             tally.topics.setdefault(note.removeprefix(f"{block.origin}: "), []).append(block.origin)
@@ -231,7 +294,7 @@ class Cutter:
         if keys.STATE in episode and keys.NEXT_STATE not in episode:
             episode = self._with_next_states(episode)
             length = len(episode[keys.STATE])
-        if length < self._mapping.min_steps:
+        if length < self.mapping.min_steps:
             self.tally.short_rows += length
             return
         terminated = episode.setdefault(keys.TERMINATED, np.zeros(length, bool))
@@ -246,7 +309,7 @@ class Cutter:
     def _with_next_states(self, episode: dict[str, Array]) -> dict[str, Array]:
         """Add the state of the next row to each row, and drop the last or let it stand still."""
         state, terminated, tally = episode[keys.STATE], is_terminated(episode), self.tally
-        if terminated and self._mapping.terminal == "stand_still":
+        if terminated and self.mapping.terminal == "stand_still":
             return episode | {keys.NEXT_STATE: np.concatenate([state[1:], state[-1:]])}
         tally.last_rows += 1
         tally.last_terminated += terminated
@@ -265,8 +328,11 @@ class Cutter:
 
     def check(self) -> None:
         """Compare fps to the rates of files, on average and without pauses; tally these, and what float32 rounds."""
-        tally, fps, time = self.tally, self._mapping.fps, self._mapping.time
-        tally.notes += self.rounded()
+        tally, fps, time = self.tally, self.mapping.fps, self.mapping.time
+        found = [each for rounding in self._rounding.values() if (each := rounding.found())]
+        if lost := [warning for warning, is_lost in found if is_lost]:
+            raise BadInputError("; ".join(lost))
+        tally.notes += [warning for warning, _ in found]
         timed = [(part.origin, spent) for part, spent in zip(self._parts, self._spent, strict=True) if spent.any()]
         if not timed and not tally.still_rows:
             return
@@ -295,13 +361,13 @@ class Cutter:
     def convert(self, block: Block) -> tuple[dict[str, Array], dict[str, Bools]]:
         """Return the columns of `block`, (n,) or (n, size), and the rows where fields are not finite."""
         faults: list[str] = []
-        fields = {name: _as_rows(name, block.values[name], faults) for name in self._mapping.fields}
+        fields = {name: _as_rows(name, block.values[name], faults) for name in self.mapping.fields}
         if faults:
             raise BadInputError(f"{block.origin}: {'; '.join(faults)}")
         columns, bad = {}, dict[str, Bools]()
-        for name in (*self._mapping.split.ends, *([self._mapping.time] if self._mapping.time else [])):
+        for name in (*self.mapping.split.ends, *([self.mapping.time] if self.mapping.time else [])):
             bad[name] = np.asarray(~np.isfinite(fields[name]).all(axis=1))
-        for name, spec in self._mapping.columns.items():
+        for name, spec in self.mapping.columns.items():
             try:
                 values = _transformed(np.concatenate([fields[f] for f in spec.fields], axis=1), spec)
                 column = self._converted.get(name) or column_of(name, spec, values.shape[1])
@@ -328,20 +394,13 @@ class Cutter:
             )
         flags = [name for name in (keys.REWARD, *MAPPED_FLAGS) if sizes.get(name, 1) > 1]
         faults += [f"{name}: {sizes[name]} values, expected 1" for name in flags]
-        if sizes and (jump := self._mapping.split.jump) and max(jump.values) >= (size := sizes[jump.column]):
+        if sizes and (jump := self.mapping.split.jump) and max(jump.values) >= (size := sizes[jump.column]):
             where = f"{jump.column} has {size} values, counted from 0"
             faults.append(f"split.jump.values {list(jump.values)}: {where}")
         if faults:
             raise BadInputError(f"{block.origin}: {'; '.join(faults)}")
-        self.columns = self.columns or _complete(self._converted, self._mapping.terminal)
+        self.columns = self.columns or _complete(self._converted, self.mapping.terminal)
         return columns, {name: mask for name, mask in bad.items() if mask.any()}
-
-    def rounded(self) -> list[str]:
-        """Return a warning for each column whose steps float32 holds badly; raise if most are lost."""
-        found = [each for rounding in self._rounding.values() if (each := rounding.found())]
-        if lost := [warning for warning, is_lost in found if is_lost]:
-            raise BadInputError("; ".join(lost))
-        return [warning for warning, _ in found]
 
 
 def column_of(name: str, spec: ColumnMapping, size: int) -> Column:

@@ -14,7 +14,7 @@ from astra_data.core.arrays import Bools, Floats, Ints
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.checkup import ANGLE, LARGEST, is_angle
 from astra_data.dataset.columns import ACTION, GOAL, STATE, SUCCESS, TERMINATED, TIMESTAMP
-from astra_data.dataset.reader import Dataset, refuse_run, refuse_versions
+from astra_data.dataset.reader import Dataset, refuse_folders
 from astra_data.io.cutting import RATE_TOLERANCE
 from astra_data.io.importers.csv import SUFFIXES, decimal_comma, is_number, numbers_of, texts_of
 from astra_data.io.recording import Source, foreign, refuse_broken_links, refuse_dataset
@@ -366,8 +366,8 @@ def csv_files(place: Path) -> list[Path]:
     found = [path for path in inside if path.suffix.lower() in SUFFIXES]
     refuse_broken_links(found)
     if not found:
-        for refuse in (refuse_versions, refuse_dataset, refuse_run):
-            refuse(place)
+        refuse_folders(place)
+        refuse_dataset(place)
         hint = foreign([str(path) for path in inside])
         raise BadInputError(
             f"{place}: {hint}{'; ' if hint else ''}expected files that end in {' or '.join(SUFFIXES)}, or a dataset: "

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from astra_data.core.errors import BadInputError
+from astra_data.core.errors import BadInputError, optional
 from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED
 
 D4RL = {
@@ -31,17 +31,17 @@ NUMBERED = "{field}_{number}"  # the pattern of episodes whose fields end with t
 MOST_COMPRESSED = 10_000  # larger than the compression ratio of any filter; beyond it, the values were never written
 
 
-def stored_datasets(h5py: Any, group: Any) -> dict[str, Any]:
+def stored_datasets(group: Any) -> dict[str, Any]:
     """Map the path of each dataset below `group` to it; links into other files are not followed."""
-    found: dict[str, Any] = {}
-    group.visititems(lambda name, item: found.update({name: item} if isinstance(item, h5py.Dataset) else {}))
+    found, kind = dict[str, Any](), optional("h5py").Dataset
+    group.visititems(lambda name, item: found.update({name: item} if isinstance(item, kind) else {}))
     return found
 
 
-def refuse_links(h5py: Any, file: Any, origin: str) -> None:
+def refuse_links(file: Any, origin: str) -> None:
     """Raise BadInputError if a file has links, which may lead into other files."""
-    links: list[str] = []
-    file.visititems_links(lambda name, link: links.extend([] if isinstance(link, h5py.HardLink) else [name]))
+    links, plain = list[str](), optional("h5py").HardLink
+    file.visititems_links(lambda name, link: links.extend([] if isinstance(link, plain) else [name]))
     if links:
         listed = ", ".join(links[:10])
         raise BadInputError(f"{origin}: {listed}: expected no links; replace each by a copy of its target")

@@ -130,16 +130,16 @@ def import_dataset(
         settings, taken = _standard(sources[0], chosen, options)
     left_out: list[str] | None = [] if skip_bad else None
     cutter = Cutter(settings, skip_bad=skip_bad)
-    cuts = episodes(sources, FORMATS[chosen], settings, cutter, left_out)
+    cuts = _episodes(sources, FORMATS[chosen], cutter, left_out)
     first = next(cuts, None)
     if first is None:
         tally = cutter.tally
         if bad := [*(left_out or ()), *tally.bad_episodes]:
             raise BadInputError("\n".join(bad))
-        refuse_rejected(tally, settings)
+        _refuse_rejected(cutter)
         faults = f" ({tally.faults})" if tally.not_finite else ""
         raise BadInputError(
-            f"{', '.join(map(str, recordings))}: no episodes, {_why_none(tally, settings)} (rows {tally.rows}, "
+            f"{', '.join(map(str, recordings))}: no episodes, {_why_none(cutter)} (rows {tally.rows}, "
             f"rejected {tally.rejected_rows}{faults}, last ones without a next state {tally.last_rows}, in episodes "
             f"that were too short {tally.short_rows})"
         )
@@ -162,7 +162,7 @@ def import_dataset(
             origins.add(str(metadata["source"]))
             frames += len(columns[TRUNCATED])
         if not skip_bad:
-            refuse_rejected(cutter.tally, settings)
+            _refuse_rejected(cutter)
         cutter.check()
         bad = [*(left_out or ()), *cutter.tally.bad_episodes]
         writer.made = {"wall_seconds": time.perf_counter() - began, **asdict(cutter.tally)}
@@ -202,9 +202,9 @@ def _standard(source: Source, file_format: str, options: Mapping[str, Any]) -> t
     return mapping, "; ".join([f"{name} from {', '.join(c.fields)}" for name, c in mapping.columns.items()] + remark)
 
 
-def _why_none(tally: Tally, mapping: ImportMapping) -> str:
+def _why_none(cutter: Cutter) -> str:
     """Return why recordings hold no episode: what cuts most of their rows, if anything does."""
-    cuts = Counter(tally.split_points)
+    tally, mapping, cuts = cutter.tally, cutter.mapping, Counter(cutter.tally.split_points)
     reasons = {
         "gap": f"'{mapping.time}' steps by over gap_s in {cuts['gap']} rows: correct time_scale or gap_s",
         "back": f"'{mapping.time}' goes back in {cuts['back']} rows, first in {tally.back_first}: sort the rows by it",
@@ -214,23 +214,17 @@ def _why_none(tally: Tally, mapping: ImportMapping) -> str:
     return found[0] if found else "and each needs two rows if logs have no next states"
 
 
-def episodes(
-    sources: Sequence[Source],
-    module: ModuleType,
-    mapping: ImportMapping,
-    cutter: Cutter,
-    left_out: list[str] | None = None,
-) -> Iterator[Cut]:
+def _episodes(sources: Sequence[Source], module: ModuleType, cutter: Cutter, faults: list[str] | None) -> Iterator[Cut]:
     """Yield the episodes of `sources`, as the format's `module` reads them and the `cutter` cuts their rows.
 
-    What is wrong with files and episodes is added to `left_out`, and they are; without it, they are refused.
+    What is wrong with files and episodes is added to `faults`, and they are left out; without it, they are refused.
     """
-    recording, size, lost = None, 0, 0
+    mapping, recording, size, lost = cutter.mapping, None, 0, 0
     try:
         for number, source in enumerate(sources):
-            source = replace(source, faults=left_out)
-            is_apart = mapping.split.files or source.recording != recording or lost < len(left_out or ())
-            lost = len(left_out or ())
+            source = replace(source, faults=faults)
+            is_apart = mapping.split.files or source.recording != recording or lost < len(faults or ())
+            lost = len(faults or ())
             try:
                 for block in _blocks(source, module, mapping):
                     size += VALUE_BYTES * sum(values.size for values in block.values.values())
@@ -240,9 +234,9 @@ def episodes(
                         yield from cutter.feed(block, is_apart=is_apart)
                         is_apart = False
             except BadInputError as error:
-                if left_out is None:
+                if faults is None:
                     raise BadInputError(_all_faults(error, sources[number:], module, mapping)) from error
-                left_out.append(str(error))
+                faults.append(str(error))
         yield from cutter.cut()
     except MemoryError as error:
         why = f"an episode does not fit into memory ({in_short(error)})"
@@ -262,10 +256,11 @@ def explained(source: Source, module: ModuleType) -> Iterator[None]:
         raise BadInputError(f"{source} cannot be read as {file_format}: {message}") from error
 
 
-def refuse_rejected(tally: Tally, mapping: ImportMapping) -> None:
-    """Raise BadInputError where rows have values that are not finite, which `mapping` refuses."""
+def _refuse_rejected(cutter: Cutter) -> None:
+    """Raise BadInputError where rows have values that are not finite, which the mapping refuses."""
+    tally = cutter.tally
     not_finite = tally.rejected_rows - tally.torn_rows
-    if not_finite and mapping.not_finite == "refuse":
+    if not_finite and cutter.mapping.not_finite == "refuse":
         raise BadInputError(
             f"{not_finite} of {tally.rows} rows have values that are not finite: {tally.faults}; set "
             'not_finite in the mapping to leave such rows out: "split" ends the episode there, "drop" goes '

@@ -21,11 +21,10 @@ from astra_data.core.durable import begun_beside
 from astra_data.core.errors import AstraDataError, BadInputError, RecipeError
 from astra_data.core.naming import base_method, first_few, shortened, stage_of_key
 from astra_data.dataset.columns import ABSTRACT_STATE, ACTION
-from astra_data.dataset.compare import lineage
 from astra_data.dataset.description import changed_values, read_description
 from astra_data.dataset.edit import share
 from astra_data.dataset.reader import Dataset
-from astra_data.dataset.versions import open_dataset
+from astra_data.dataset.versions import lineage, open_dataset
 from astra_data.grounding.paired_episodes import divided
 from astra_data.io.hub.stores import is_address
 from astra_data.methods import METHODS, grounded_as, method_named

@@ -12,7 +12,7 @@ import pytest
 from fake_dataset import NAMES, fake_columns, write_fake
 from shared_runs import shared
 
-from astra_data.dataset import parquet
+from astra_data.dataset import format as layout
 from astra_data.dataset.columns import Episode
 from astra_data.dataset.frames import Frames
 from astra_data.dataset.reader import Dataset
@@ -39,13 +39,13 @@ def root(dataset: Dataset) -> Path:
 @pytest.fixture
 def lonely(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each episode gets a row group of its own."""
-    monkeypatch.setattr(parquet, "GROUP_ROWS", 1)
+    monkeypatch.setattr(layout, "GROUP_ROWS", 1)
 
 
 @pytest.fixture
 def scattered(lonely: None, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each episode gets a file of its own."""
-    monkeypatch.setattr(parquet, "FILE_SIZE_LIMIT", 500)
+    monkeypatch.setattr(layout, "FILE_SIZE_LIMIT", 500)
 
 
 @pytest.fixture(scope="session")

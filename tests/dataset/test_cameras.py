@@ -17,11 +17,10 @@ from astra_data.dataset.cameras import ClipWriter, clip_fault, decoded
 from astra_data.dataset.columns import Clip
 from astra_data.dataset.doctor.check import check
 from astra_data.dataset.doctor.repair import repair
-from astra_data.dataset.edit import filter_episodes, merge, subset
+from astra_data.dataset.edit import filter_episodes, merge, resample, subset, trim
 from astra_data.dataset.frames import Frames
 from astra_data.dataset.inspection import inspect_dataset
 from astra_data.dataset.reader import Dataset
-from astra_data.dataset.timing import resample, trim
 from astra_data.dataset.versions import next_version
 from astra_data.io.hub.card import Notes, render_card
 from astra_data.io.hub.stores import dataset_files
@@ -60,7 +59,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 
 def recorded(folder: Path, first: int, **options: str) -> Dataset:
     patch = pytest.MonkeyPatch()
-    patch.setattr("astra_data.dataset.parquet.FILE_SIZE_LIMIT", 100)
+    patch.setattr("astra_data.dataset.format.FILE_SIZE_LIMIT", 100)
     patch.setattr("astra_data.dataset.format.VIDEO_FILE_SIZE_MB", 0)
     total = first + sum(LENGTHS.values())
     stills = (np.full((4, 4, 3), number, np.uint8) for number in range(total))
@@ -142,13 +141,13 @@ def test_lerobots_loader_shows_the_same_pictures(lerobot: SimpleNamespace, sourc
 @pytest.mark.parametrize(("codec", "group"), [("libx264", "12"), ("libx264", "250"), ("libx265", "250")])
 def test_frames_are_cut_within_groups_and_encoded_again_in_long_ones(codec: str, group: str, tmp_path: Path) -> None:
     clip = Clip(film(tmp_path / "film.mp4", 90, codec, g=group), FRONT, 31 / FPS, 1 / FPS, 39)
-    written = ClipWriter(lambda number: tmp_path / f"{number}.mp4", FPS)
+    written, path = ClipWriter(tmp_path, FRONT, FPS), tmp_path / f"videos/{FRONT}/chunk-000/file-000.mp4"
     spans = [written.add(clip), written.add(clip.part(5, 25))]
     written.close()
     assert [(span.file, round((span.to_s - span.from_s) * FPS)) for span in spans] == [(0, 39), (0, 20)]
     pieces = zip(spans, (39, 20), strict=True)
-    copies = [decoded(Clip(tmp_path / "0.mp4", FRONT, at.from_s, 1 / FPS, count)) for at, count in pieces]
-    with av.open(str(tmp_path / "0.mp4")) as file, av.open(str(clip.path)) as source:
+    copies = [decoded(Clip(path, FRONT, at.from_s, 1 / FPS, count)) for at, count in pieces]
+    with av.open(str(path)) as file, av.open(str(clip.path)) as source:
         # lerobot's merge joins files with one time base.
         assert group == "250" or file.streams.video[0].time_base == source.streams.video[0].time_base
         keys = [

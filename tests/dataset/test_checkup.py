@@ -24,6 +24,7 @@ from astra_data.dataset.checkup import (
     repeated,
     repeats,
     shift,
+    torn_steps,
 )
 from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE, Array, Column, Episode
 
@@ -145,8 +146,9 @@ def test_a_step_leads_to_the_row_after_it(shape: tuple[int, ...]) -> None:
     off = arrived.copy()
     off[1] = np.nextafter(off[1], np.float32(100))
     episodes = [Episode(uid, {STATE: state[:n], NEXT_STATE: arrived[:n]}) for uid, n in ((0, 6), (1, 1))]
-    assert not continuity(episodes)
-    (found,) = continuity([*episodes, Episode(4, {STATE: state, NEXT_STATE: off})])
+    counts = {one.uid: torn_steps(one) for one in episodes}
+    assert not continuity(counts)
+    (found,) = continuity(counts | {4: torn_steps(Episode(4, {STATE: state, NEXT_STATE: off}))})
     assert found.severity == "warning" and found.episodes == (4,)
     assert found.what == "steps whose next.observation.state is not the state of the next row: 1 of 10"
 

@@ -11,7 +11,8 @@ from damaged import DATA, EPISODES, alter, edit, reseal
 from fake_dataset import concatenated, fake_episodes
 
 from astra_data.core.errors import BadInputError, CorruptDatasetError
-from astra_data.dataset import Dataset, description, parquet
+from astra_data.dataset import Dataset, description
+from astra_data.dataset import format as layout
 from astra_data.dataset.columns import ACTION, REWARD, STATE
 from astra_data.dataset.format import DATA_PATH, DATASET_PATH, DIGESTS_PATH
 from astra_data.dataset.plain import is_data_path
@@ -118,7 +119,7 @@ def test_the_file_holds_a_digest_of_each_episode_and_column(fake: Dataset) -> No
 def test_an_altered_value_is_refused_before_it_is_seen(
     root: Path, monkeypatch: pytest.MonkeyPatch, block_rows: int, rows: int
 ) -> None:
-    monkeypatch.setattr(parquet, "BLOCK_ROWS", block_rows)
+    monkeypatch.setattr(layout, "BLOCK_ROWS", block_rows)
     alter(DATA, REWARD, 25, 9.0)(root)
     pq.write_table(pq.read_table(root / DATA), root / DATA, row_group_size=rows)
     dataset = Dataset.open(root)

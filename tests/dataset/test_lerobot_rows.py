@@ -9,7 +9,7 @@ from astra_data.core.errors import CorruptDatasetError
 from astra_data.dataset import columns as names
 from astra_data.dataset.columns import STATE, Array, Column
 from astra_data.dataset.format import DEFAULT_COLUMNS
-from astra_data.dataset.lerobot_recording import RECORDED_TASK, Rows, declared_columns, found_in, name_of
+from astra_data.dataset.lerobot_recording import RECORDED_TASK, Rows, declared_columns, description_of, found_in
 from astra_data.dataset.plain import PlainColumn, Run
 
 STEPS = 4
@@ -174,4 +174,5 @@ def test_without_lerobots_own_columns_or_a_whole_rate_nothing_is_known(info: dic
 
 
 def test_a_folder_gives_a_valid_name() -> None:
-    assert [name_of(Path(name)) for name in ("walks", "my set (2)", "-._")] == ["walks", "my-set-2-", "repaired"]
+    names = [description_of(Path(name), {}, "repair", {})["name"] for name in ("walks", "my set (2)", "-._")]
+    assert names == ["walks", "my-set-2-", "repaired"]

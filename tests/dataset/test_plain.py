@@ -28,11 +28,11 @@ def test_only_rows_of_numbers_are_plain_columns() -> None:
 
 
 def test_a_column_fits_lists_with_and_without_their_size() -> None:
-    column = plain.PlainColumn("state", "float32", 3)
-    assert column.fits(pa.list_(pa.float32(), 3)) and column.fits(pa.list_(pa.float32()))
-    assert not column.fits(pa.list_(pa.float32(), 2)) and not column.fits(pa.list_(pa.float64()))
-    single = plain.PlainColumn("reward", "float32", 1)
-    assert single.fits(pa.float32()) and not single.fits(pa.list_(pa.float32()))
+    cases = [(3, pa.list_(pa.float32(), 3)), (3, pa.list_(pa.float32())), (1, pa.float32())]
+    wrong = [(3, pa.list_(pa.float32(), 2)), (3, pa.list_(pa.float64())), (1, pa.list_(pa.float32()))]
+    for size, kind in cases + wrong:
+        faults = plain.schema_faults(pa.schema([("x", kind)]), [plain.PlainColumn("x", "float32", size)])
+        assert len(faults) == ((size, kind) in wrong)
 
 
 @pytest.mark.parametrize(

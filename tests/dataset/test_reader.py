@@ -13,7 +13,8 @@ from damaged import DATA, alter
 from fake_dataset import COLUMNS, LENGTHS, assert_same, concatenated, fake_columns, fake_episodes, write_fake
 
 from astra_data.core.errors import BadInputError, CorruptDatasetError
-from astra_data.dataset import Dataset, parquet
+from astra_data.dataset import Dataset
+from astra_data.dataset import format as layout
 from astra_data.dataset.columns import ACTION, STATE, SUCCESS, Episode
 from astra_data.dataset.doctor.check import check
 from astra_data.dataset.doctor.repair import repair
@@ -23,7 +24,7 @@ from astra_data.dataset.doctor.repair import repair
 def test_values_come_back_whole_and_episode_by_episode(
     fake: Dataset, monkeypatch: pytest.MonkeyPatch, block_rows: int
 ) -> None:
-    monkeypatch.setattr(parquet, "BLOCK_ROWS", block_rows)
+    monkeypatch.setattr(layout, "BLOCK_ROWS", block_rows)
     for name, values in fake.columns([column.name for column in COLUMNS]).items():
         expected = concatenated(name)
         assert values.dtype == expected.dtype and values.flags.c_contiguous
@@ -42,7 +43,7 @@ def test_values_come_back_whole_and_episode_by_episode(
 def test_only_the_row_groups_of_chosen_episodes_are_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, group_rows: int, chosen: list[int], groups: list[int]
 ) -> None:
-    monkeypatch.setattr(parquet, "GROUP_ROWS", group_rows)
+    monkeypatch.setattr(layout, "GROUP_ROWS", group_rows)
     dataset = write_fake(tmp_path / "set")
     read = pq.ParquetFile.read_row_groups
     found: list[int] = []

@@ -24,7 +24,8 @@ from forks import forked
 from shared_files import contents
 
 from astra_data.core.errors import BadInputError
-from astra_data.dataset import Dataset, DatasetWriter, parquet
+from astra_data.dataset import Dataset, DatasetWriter
+from astra_data.dataset import format as layout
 from astra_data.dataset import statistics as episode_rows
 from astra_data.dataset.columns import ACTION, DONE, REWARD, STATE, TERMINATED, TRUNCATED, Column, Episode
 from astra_data.dataset.format import DATASET_PATH
@@ -68,7 +69,7 @@ def test_how_it_was_made_is_told_beside_the_content_hash_only(fake: Dataset, tmp
 def test_small_episodes_share_a_row_group(
     fake: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, group_rows: int, lengths: tuple[int, ...]
 ) -> None:
-    monkeypatch.setattr(parquet, "GROUP_ROWS", group_rows)
+    monkeypatch.setattr(layout, "GROUP_ROWS", group_rows)
     dataset = write_fake(tmp_path / "set")
     metadata = pq.read_metadata(dataset.paths[0])
     assert tuple(metadata.row_group(group).num_rows for group in range(metadata.num_row_groups)) == lengths
@@ -96,8 +97,8 @@ def test_encodings_suit_the_values(fake: Dataset) -> None:
 
 @pytest.mark.usefixtures("lonely")
 def test_files_rotate_when_full(fake: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parquet, "FILE_SIZE_LIMIT", 2_000)
-    monkeypatch.setattr(parquet, "CHUNK_SIZE", 2)
+    monkeypatch.setattr(layout, "FILE_SIZE_LIMIT", 2_000)
+    monkeypatch.setattr(layout, "CHUNK_SIZE", 2)
     monkeypatch.setattr(episode_rows, "ROWS_AT_ONCE", 2)
     split = write_fake(tmp_path / "split")
     names = [str(path.relative_to(split.root)) for path in split.paths]

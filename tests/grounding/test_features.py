@@ -8,9 +8,8 @@ from fake_dataset import fake_episode, write_images, writer
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import Clip
-from astra_data.dataset.edit import subset
+from astra_data.dataset.edit import subset, trim
 from astra_data.dataset.reader import Dataset
-from astra_data.dataset.timing import trim
 from astra_data.grounding.features import DEFAULT, ENCODER, encoded, features
 
 TOP, COLUMN = "observation.images.top", "observation.features.top"

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from astra_data.core.errors import BadInputError
-from astra_data.dataset.columns import DONE, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED, Array
-from astra_data.io.cutting import Cutter, column_of
+from astra_data.dataset.columns import DONE, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED, Array, Column
+from astra_data.io import cutting
+from astra_data.io.cutting import Cutter, Rounding, column_of
 from astra_data.io.mapping import ColumnMapping, ImportMapping
 from astra_data.io.recording import Block
 
@@ -139,7 +140,8 @@ def rounding(spec: dict[str, Any], values: Array) -> list[str]:
     made = converter({"c": {"fields": ("f",), **spec}})
     for block in (values[: len(values) // 2], values[len(values) // 2 :]):
         made.convert(Block({"f": block}, "log"))
-    return made.rounded()
+    made.check()
+    return made.tally.notes
 
 
 ROWS = np.arange(60)
@@ -191,3 +193,25 @@ def test_large_numbers_most_of_whose_steps_are_lost_are_refused(start: float, st
 )
 def test_steps_that_float32_holds_are_not_warned_of(values: Array) -> None:
     assert rounding({}, values) == []
+
+
+def told(*blocks: Array) -> tuple[str, bool] | None:
+    """Return what is found of rounding in `blocks` of a value y."""
+    found = Rounding(Column("position", size=1, names=("y",)))
+    for block in blocks:
+        found.add(block[:, None], block.astype(np.float32)[:, None])
+    return found.found()
+
+
+def test_steps_are_compared_with_those_that_float32_holds(monkeypatch: pytest.MonkeyPatch) -> None:
+    steps = np.arange(11.0)  # ten of them are enough
+    south = told(-4_429_530 - 0.63 * steps)
+    assert south is not None and "y (up to 4.42954e+06) in steps of 0.5, but it moves by 0.63" in south[0]
+    assert south[0].endswith("set offset = [4429533.0]") and told(-4_429_530 - 0.63 * steps[1:]) is None
+    counted = told(2.0**24 + steps)
+    assert counted is not None and not counted[1] and told(1e15 + steps) is not None
+    assert told(2**63 + np.arange(11, dtype=np.uint64)) is not None
+    tiny = 2.0**-32 * steps
+    assert told(2.0**20 + 100 * tiny) is not None and told(2.0**20 + 10 * tiny) is None  # the noise of float64
+    monkeypatch.setattr(cutting, "_MOST_SAMPLES", 20)
+    assert told(np.full(11, 2.0**24), *[2.0**24 + 0.3 * steps] * 2) is not None

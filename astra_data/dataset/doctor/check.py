@@ -21,8 +21,8 @@ from astra_data.dataset import format as layout
 from astra_data.dataset import plain
 from astra_data.dataset.cameras import clip_fault, read_cameras
 from astra_data.dataset.columns import Array
-from astra_data.dataset.parquet import read_blocks
-from astra_data.dataset.reader import Dataset, format_fault, refuse_run, refuse_versions
+from astra_data.dataset.format import read_blocks
+from astra_data.dataset.reader import Dataset, format_fault, refuse_folders
 from astra_data.dataset.statistics import episode_statistics, pooled, side_by_side
 
 _META_FILES = (*described.SEALED, layout.DATASET_PATH, layout.POLICY_PATH)
@@ -76,8 +76,7 @@ class Report:
 def check(root: Path) -> Report:
     """Check the dataset in folder `root`: its files, every value and, if it is ours, its digests."""
     if not (root / "meta").is_dir() and not (root / "data").is_dir():
-        refuse_versions(root)
-        refuse_run(root)
+        refuse_folders(root)
         raise BadInputError(f"{root}: found no dataset; expected a folder with meta/ and data/")
     report = Report()
     info = plain.read_object(root / layout.INFO_PATH)
@@ -269,8 +268,8 @@ class EpisodeChecks:
                 report.note("flags", fault)
         if unknown := [t for t in np.unique(run.columns[names.TASK_INDEX]).tolist() if t not in self.tasks]:
             report.fault("tasks", f"episode {number} has the unknown tasks {unknown}")
-        if altered := described.altered_columns(run.columns, number, self.digests):
-            report.fault("values", described.alteration(altered, run.path, run.row, len(run), number))
+        if altered := described.alteration(run.columns, number, self.digests, run.path, run.row):
+            report.fault("values", altered)
 
     def _check_row(self, number: int, run: plain.Run, row: Mapping[str, Any]) -> None:
         start = self.report.frames

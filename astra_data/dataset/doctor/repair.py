@@ -19,7 +19,7 @@ from astra_data.dataset.columns import Array, Column, Episode, Scalar, distinct_
 from astra_data.dataset.description import Digests, altered_files, read_description, read_digests
 from astra_data.dataset.doctor.salvage import whole_runs
 from astra_data.dataset.plain import PlainColumn, Run, is_format_2, read_object, read_small_table, read_tasks
-from astra_data.dataset.reader import Dataset, refuse_run, refuse_versions
+from astra_data.dataset.reader import Dataset, refuse_folders
 from astra_data.dataset.versions import successor
 from astra_data.dataset.writer import DatasetWriter
 
@@ -58,14 +58,13 @@ def repair(
     """
     if not folder.is_dir():
         raise BadInputError(f"{folder}: expected the folder of a dataset, got no folder")
-    refuse_versions(folder)
-    refuse_run(folder)
+    refuse_folders(folder)
     sources = [like] if isinstance(like, Dataset) else list(like or ())
     result = Repaired()
     notes = result.notes
     remains = remains_of(folder, sources, notes)
     rows, tasks = remains.rows, remains.tasks
-    whole = partial(whole_runs, folder, remains.columns, remains.digests, remains.fps, repeated=new_uids)
+    whole = partial(whole_runs, folder, remains.columns, remains.digests, remains.fps, new_uids)
     joined: list[Joined] = []
     if sources or new_uids:
         stored = [spec for spec in remains.specs if spec.name in {column.name for column in remains.columns}]
@@ -76,10 +75,14 @@ def repair(
     recorded: list[lerobot.Found] = []
     theirs = {uid for source in sources for uid in source.uids.tolist()}
     task = " / ".join(str(tasks[index]) for index in sorted(tasks)) or "unknown"
-    description, seed = _description(folder, remains, sources), remains.subset_seed
+    config, old = {"folder": folder.name}, sources[0].description if sources else remains.old
+    description = lerobot.description_of(folder, remains.info, "repair", config)
+    if old:
+        made_from = [other.identity for other in sources[1:]]
+        description = successor(old, "episodes", stage="repair", config=config, out=folder, parents=made_from)[0]
     cameras = _seen(folder, remains, whole, notes)
     features = {name: camera.feature for name, camera in cameras.items()}
-    known_facts: dict[str, Any] = {"task": task, "description": description, "subset_seed": seed}
+    known_facts: dict[str, Any] = {"task": task, "description": description, "subset_seed": remains.subset_seed}
     with DatasetWriter(out, remains.specs, fps=remains.fps, cameras=features, **known_facts) as writer:
         for number, (uid, run) in enumerate(whole(notes)):
             known = joined[number] if joined else Joined(uid, {}, is_known=False)
@@ -181,14 +184,13 @@ def join(
     found = [(uid, _digest(values, shared)) for uid, values in episodes]
     renames = distinct_uids(found)
     renamed: dict[int | None, dict[int, int]] = {}
-    for key, name in zip(found, renames, strict=True):
-        renamed.setdefault(known.get(key, (None, {}))[0], {})[key[0]] = name
-    joined = []
-    for key, name in zip(found, renames, strict=True):
-        origin, facts = known.get(key, (None, {}))
-        metadata = renamed_metadata(key[0], facts, renamed[origin] | {key[0]: name})
-        joined.append(Joined(name, metadata, key in known))
-    return joined
+    each = [(key[0], name, *known.get(key, (None, {}))) for key, name in zip(found, renames, strict=True)]
+    for uid, name, origin, _ in each:
+        renamed.setdefault(origin, {})[uid] = name
+    return [
+        Joined(name, renamed_metadata(uid, facts, renamed[origin] | {uid: name}), origin is not None)
+        for uid, name, origin, facts in each
+    ]
 
 
 def _digest(values: Mapping[str, Array], columns: Sequence[Column]) -> bytes:
@@ -250,8 +252,9 @@ def remains_of(folder: Path, sources: Sequence[Dataset], notes: list[str]) -> Re
     if layout.SUBSETS_PATH not in altered:
         subsets = read_object(folder / layout.SUBSETS_PATH)
         stored = subsets.get("seed") if isinstance(subsets, dict) else None
-        remains.subset_seed = stored if isinstance(stored, int) else 0
-        if not isinstance(stored, int):
+        if isinstance(stored, int):
+            remains.subset_seed = stored
+        else:
             fault = subsets if isinstance(subsets, str) else "has no whole number as its seed"
             notes.append(f"{layout.SUBSETS_PATH} {fault}: {_IF_ALTERED[layout.SUBSETS_PATH]}")
     return remains
@@ -288,16 +291,3 @@ def _metadata(folder: Path, notes: list[str]) -> dict[int, dict[str, Scalar]]:
     if not found:
         notes.append(f"{layout.METADATA_PATH} {table if isinstance(table, str) else 'has no uids'}: {_LOST}")
     return found
-
-
-def _description(folder: Path, remains: Remains, sources: Sequence[Dataset]) -> dict[str, Any]:
-    config, old = {"folder": folder.name}, sources[0].description if sources else remains.old
-    if not old:
-        return {
-            "name": lerobot.name_of(folder),
-            "stage": "repair",
-            "config": config,
-            "environment": lerobot.robot_of(remains.info),
-        }
-    parents = [other.identity for other in sources[1:]]
-    return successor(old, "episodes", stage="repair", config=config, out=folder, parents=parents)[0]

@@ -15,9 +15,8 @@ import pyarrow.parquet as pq
 from astra_data.core.errors import CorruptDatasetError, in_short
 from astra_data.dataset import columns as names
 from astra_data.dataset import plain
-from astra_data.dataset.description import Digests, alteration, altered_columns
-from astra_data.dataset.format import INFO_PATH
-from astra_data.dataset.parquet import UNREADABLE
+from astra_data.dataset.description import Digests, alteration
+from astra_data.dataset.format import INFO_PATH, UNREADABLE, arrow_type
 
 _DICTIONARY, _DATA_V2 = 2, 3
 _FIELDS = {0: (5, 2), _DICTIONARY: (7, 2), _DATA_V2: (8, 4)}
@@ -29,18 +28,14 @@ _PIECES = 256  # of a row group that has rows which cannot be read
 _IMAGE = pa.struct({"bytes": pa.binary(), "path": pa.string()})
 TRUE, FALSE, BYTE, I16, I32, I64 = range(1, 7)
 BINARY, LIST, STRUCT = 8, 9, 12
+Columns = Sequence[plain.PlainColumn]
+Stretch = tuple[int, int, pa.Table | str]  # first row, end, and the table or what is wrong with it
 Struct = dict[int, tuple[int, Any]]
 """Of Thrift's compact protocol: field number to (type, value); the value of a list is (type, values)."""
 
 
 def whole_runs(
-    folder: Path,
-    columns: Sequence[plain.PlainColumn],
-    digests: Digests,
-    fps: int,
-    notes: list[str],
-    *,
-    repeated: bool = False,
+    folder: Path, columns: Columns, digests: Digests, fps: int, repeated: bool, notes: list[str]
 ) -> Iterator[tuple[int, plain.Run]]:
     """Yield the uid and the rows of each intact episode, repeated uids if asked; add to `notes` what was left out.
 
@@ -57,7 +52,7 @@ def whole_runs(
     counted = info.get("total_episodes")
     most = len(next(iter(digests.values()))) if digests else counted if isinstance(counted, int) else 2**31
     features = listed if isinstance(listed := info.get("features"), Mapping) else {}
-    stored = {column.name: column.arrow_type for column in columns}
+    stored = {column.name: arrow_type(column.dtype, column.size) for column in columns}
     pictured = (name for name, of in features.items() if isinstance(of, Mapping) and of.get("dtype") == "image")
     stored = dict.fromkeys(pictured, _IMAGE) | stored
     schema = pa.schema([(name, stored[name]) for name in dict.fromkeys([*features, *stored]) if name in stored])
@@ -84,14 +79,13 @@ def whole_runs(
             notes.append(_lost(episode, number - 1))
             episode, row = number, first
         faults = [fault for _, fault in plain.run_faults(run, number=episode, row=row, fps=fps)]
-        altered = altered_columns(run.columns, episode, digests)
+        altered = alteration(run.columns, episode, digests, run.path, run.row)
         if (place := places.get(episode)) and place.length != len(run) and (altered or episode >= most or not digests):
             faults.append(f"it has {len(run)} frames, expected {place.length}")
         if episode >= most and digests:
             faults.append(f"expected {most} episodes")
         faults += plain.flag_faults(run.columns, f"episode {episode} ")
-        if altered:
-            faults.append(alteration(altered, run.path, run.row, len(run), episode))
+        faults += [altered] if altered else []
         uid = int(run.columns.get(names.EPISODE_UID, [episode])[0])
         if uid < 0 or (uid in uids and not repeated):
             faults.append(f"its uid {uid} is taken or negative")
@@ -114,9 +108,7 @@ def _name(path: Path) -> str:
     return "/".join(path.parts[-3:])
 
 
-def _every_run(
-    root: Path, columns: Sequence[plain.PlainColumn], schema: pa.Schema, notes: list[str]
-) -> Iterator[tuple[plain.Run, bool]]:
+def _every_run(root: Path, columns: Columns, schema: pa.Schema, notes: list[str]) -> Iterator[tuple[plain.Run, bool]]:
     """Yield each run, and whether the rows after it cannot be read."""
     for path in plain.data_files(root):
         try:
@@ -125,9 +117,7 @@ def _every_run(
             notes.append(f"{_name(path)} cannot be read: {in_short(error)}")
 
 
-def _runs_of(
-    path: Path, columns: Sequence[plain.PlainColumn], schema: pa.Schema, notes: list[str]
-) -> Iterator[tuple[plain.Run, bool]]:
+def _runs_of(path: Path, columns: Columns, schema: pa.Schema, notes: list[str]) -> Iterator[tuple[plain.Run, bool]]:
     """Yield the runs of a file, and whether the rows after each cannot be read."""
     is_whole = not isinstance(plain.read_footer(path), str)
     held: plain.Run | None = None
@@ -153,7 +143,7 @@ def _runs_of(
         yield held, not is_whole and len(held) != last
 
 
-def _stretches(file: pq.ParquetFile, columns: Sequence[plain.PlainColumn]) -> Iterator[tuple[int, int, pa.Table | str]]:
+def _stretches(file: pq.ParquetFile, columns: Columns) -> Iterator[Stretch]:
     """Yield first row, end and table of stretches of a file, or what is wrong with them."""
     first = 0
     for group in range(file.num_row_groups):
@@ -166,9 +156,7 @@ def _stretches(file: pq.ParquetFile, columns: Sequence[plain.PlainColumn]) -> It
         first = end
 
 
-def _readable(
-    first: int, table: pa.Table, columns: Sequence[plain.PlainColumn], least: int
-) -> Iterator[tuple[int, int, pa.Table | str]]:
+def _readable(first: int, table: pa.Table, columns: Columns, least: int) -> Iterator[Stretch]:
     """Yield a table, from the row `first` on, or its halves, of `least` rows, where a value of it cannot be read."""
     try:
         if not plain.schema_faults(table.schema, columns):

@@ -152,18 +152,15 @@ def pull(
     if total > max_bytes:
         raise SharingError(f"{remote.name} has {total} bytes, {too_large}")
     partial = target.with_name(f".{target.name}.pull-{description['version']}")
-    try:
-        with folder_for(target), _begun(partial, sums):
-            for number, path in enumerate(stores.altered(partial, sums)):
-                progress(number / len(sums), path)
-                max_bytes -= fetch(remote, path, partial, max_bytes + 1)
-                if max_bytes < 0:  # where the place does not know sizes
-                    (partial / path).unlink()
-                    raise SharingError(f"{remote.name} has more bytes, {too_large}")
-            _check(partial, sums, description, remote.name)
-            publish(partial, target)
-    except OSError as error:
-        raise BadInputError(f"{target} cannot be written ({error}); choose another folder.") from error
+    with writing(target), folder_for(target), _begun(partial, sums):
+        for number, path in enumerate(stores.altered(partial, sums)):
+            progress(number / len(sums), path)
+            max_bytes -= fetch(remote, path, partial, max_bytes + 1)
+            if max_bytes < 0:  # where the place does not know sizes
+                (partial / path).unlink()
+                raise SharingError(f"{remote.name} has more bytes, {too_large}")
+        _check(partial, sums, description, remote.name)
+        publish(partial, target)
     progress(1.0, f"{len(sums)} files")
     return Dataset.open(target)
 

@@ -261,18 +261,14 @@ class UrlStore:
         self.url = url
         protocol = url.partition("://")[0].lower()
         self._is_local = protocol in ("file", "local")
-        try:
-            with explained(url):
+        with explained(url):
+            try:
                 self._filesystem, self._path = fsspec.core.url_to_fs(url)
-        except SharingError as error:
-            cause = error.__cause__
-            if not isinstance(cause, ImportError | ValueError):
-                raise
-            how = f"expected a URL such as s3://bucket/folder ({cause})"
-            if isinstance(cause, ImportError):
-                how = how_to_install(EXTRAS[protocol]) if protocol in EXTRAS else str(cause)
-                how = f"the package for {protocol}:// is not installed: {how}"
-            raise BadInputError(f"{url}: {how}") from error
+            except ValueError as error:
+                raise BadInputError(f"{url}: expected a URL such as s3://bucket/folder ({error})") from error
+            except ImportError as error:
+                how = how_to_install(EXTRAS[protocol]) if protocol in EXTRAS else error
+                raise BadInputError(f"{url}: the package for {protocol}:// is not installed: {how}") from error
 
     def __str__(self) -> str:
         return self.url

@@ -4,7 +4,6 @@ import json
 import math
 import re
 from collections.abc import Iterator
-from contextlib import contextmanager
 from fnmatch import fnmatchcase
 from typing import Any
 
@@ -22,8 +21,8 @@ _COMMANDS = re.compile(r"(?<![a-z])actions?(?![a-z])")  # observations that are,
 
 def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     """Yield the rows of each episode's group, or of the file where `mapping.episodes` is left out."""
-    with _opened(source) as (h5py, file):
-        for origin, datasets, attributes in _episodes(h5py, file, mapping.episodes, str(source)):
+    with _opened(source) as file:
+        for origin, datasets, attributes in _episodes(file, mapping.episodes, str(source)):
             with source.tolerant():
                 yield from _blocks(source, mapping, origin, datasets, attributes)
 
@@ -52,17 +51,14 @@ def _blocks(
         yield Block(values, origin, starts=mapping.episodes is not None, known=known)
 
 
-@contextmanager
-def _opened(source: Source) -> Iterator[tuple[Any, Any]]:
+def _opened(source: Source) -> Any:
     with source.open() as stream:
         if stream.read(10) == b"MATLAB 5.0":
             raise BadInputError(
                 f"{source} is of MATLAB's format 5, expected 7.3, which is HDF5: in MATLAB, load it and "
                 "save('NEW.mat', '-v7.3'); in Python, save the arrays of scipy.io.loadmat by numpy.savez"
             )
-    h5py = optional("h5py")
-    with h5py.File(source.path, "r") as file:
-        yield h5py, file
+    return optional("h5py").File(source.path, "r")
 
 
 def layout(source: Source) -> dict[str, Any]:
@@ -71,8 +67,8 @@ def layout(source: Source) -> dict[str, Any]:
     Of robomimic, the state is all of `obs` with one or two dimensions but actions, in the order of their names; `dones`
     is taken as terminated, as its own learners do; the attribute `success` is that of a demonstration's last step.
     """
-    with _opened(source) as (h5py, file):
-        fields = stored_datasets(h5py, file)
+    with _opened(source) as file:
+        fields = stored_datasets(file)
         if {"observations", "actions"} <= fields.keys():
             columns = {name: {"fields": [field]} for name, field in D4RL.items() if field in fields}
             stacked = {fields[field].shape[:2] for field in ("observations", "actions")}
@@ -87,7 +83,7 @@ def layout(source: Source) -> dict[str, Any]:
                 f"{source}: neither D4RL's layout (observations, actions) nor d3rlpy's (observations_0) nor "
                 "robomimic's (data/demo_0); pass --mapping"
             )
-        demo = stored_datasets(h5py, file[f"data/{demos[0]}"])
+        demo = stored_datasets(file[f"data/{demos[0]}"])
         columns = {name: {"fields": [field]} for name, field in ROBOMIMIC.items() if field in demo}
         commands = [field for field in demo if field.startswith("obs/") and _COMMANDS.search(field)]
         for name, folder in ((STATE, "obs/"), (NEXT_STATE, "next_obs/")):
@@ -137,25 +133,23 @@ def _refuse_groups(stored: dict[str, Any], mapping: ImportMapping, origin: str) 
         )
 
 
-def _episodes(
-    h5py: Any, file: Any, pattern: str | None, origin: str
-) -> Iterator[tuple[str, dict[str, Any], dict[str, Any]]]:
+def _episodes(file: Any, pattern: str | None, origin: str) -> Iterator[tuple[str, dict[str, Any], dict[str, Any]]]:
     """Yield the name of each episode's part of the file, its fields, and its attributes as "@name"."""
     if pattern != NUMBERED:
-        for group in _groups(h5py, file, pattern, origin):
+        for group in _groups(file, pattern, origin):
             attributes = {f"@{name}": np.asarray(value) for name, value in group.attrs.items()}
-            yield f"{origin}{group.name}".rstrip("/"), stored_datasets(h5py, group), attributes
+            yield f"{origin}{group.name}".rstrip("/"), stored_datasets(group), attributes
         return
     numbered: dict[int, dict[str, Any]] = {}
-    for name, dataset in stored_datasets(h5py, file).items():
+    for name, dataset in stored_datasets(file).items():
         if found := re.fullmatch(r"(.+)_([0-9]+)", name):
             numbered.setdefault(int(found[2]), {})[found[1]] = dataset
     for number in sorted(numbered):
         yield f"{origin}/{number}", numbered[number], {}
 
 
-def _groups(h5py: Any, file: Any, pattern: str | None, origin: str) -> list[Any]:
-    groups = [file]
+def _groups(file: Any, pattern: str | None, origin: str) -> list[Any]:
+    groups, h5py = [file], optional("h5py")
     if pattern is None:
         return groups
     for part in pattern.strip("/").split("/"):

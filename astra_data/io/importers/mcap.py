@@ -278,6 +278,9 @@ class MessageField:
         self._names = names
 
 
+Fields = dict[str, list[MessageField]]  # topic to what is taken of its messages
+
+
 def check(source: Source, mapping: ImportMapping) -> None:
     """Raise BadInputError where the index of a file lacks topics."""
     McapFile(source, {name.partition(":")[0] for name in mapping.all_fields})
@@ -286,7 +289,7 @@ def check(source: Source, mapping: ImportMapping) -> None:
 def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     """Yield rows at the rate `mapping.fps`."""
     _check_mapping(mapping, str(source))
-    by_topic: dict[str, list[MessageField]] = {}
+    by_topic: Fields = {}
     for each in map(MessageField, mapping.all_fields):
         by_topic.setdefault(each.topic, []).append(each)
     file = McapFile(source, by_topic.keys())
@@ -315,7 +318,7 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
         yield replace(block, torn=file.is_cut, notes=resampler.unevenness())
 
 
-def _by_publisher(file: McapFile, fields: dict[str, list[MessageField]]) -> dict[str, list[MessageField]]:
+def _by_publisher(file: McapFile, fields: Fields) -> Fields:
     """Treat what several publishers send to one topic, each its own joints, as topics of their own, named by both."""
     named = {topic for topic, each in fields.items() if any(field.wanted for field in each)}
     sent: dict[str, set[frozenset[str]]] = {topic: set() for topic in named}
@@ -346,9 +349,7 @@ def _streams(file: McapFile, fields: Sequence[MessageField], of: dict[str, str],
     return sorted({of[name] for name in _sent(file, fields, message)})
 
 
-def _messages(
-    source: Source, timeline: Timeline, fields: Mapping[str, list[MessageField]]
-) -> Iterator[tuple[str, int, Message]]:
+def _messages(source: Source, timeline: Timeline, fields: Fields) -> Iterator[tuple[str, int, Message]]:
     sizes: dict[str, tuple[int, ...]] = {}
     for topic, time, log_time, content in timeline.messages():
         values, faults = dict[str, Array](), list[str]()
@@ -364,9 +365,7 @@ def _messages(
         yield topic, time, (log_time, values)
 
 
-def _block(
-    source: Source, rows: Mapping[str, Sequence[Message]], fields: Mapping[str, Sequence[MessageField]]
-) -> Block:
+def _block(source: Source, rows: Mapping[str, Sequence[Message]], fields: Fields) -> Block:
     """Return the rows of an episode, with each topic's messages; their times name what is not finite."""
     values, places = {}, dict[int, str]()
     for topic, messages in rows.items():

@@ -55,13 +55,13 @@ def layout(source: Source) -> dict[str, Any]:
 
 def _open(source: Source) -> Any:
     """Open the dataset; Minari itself reads whole episodes, and follows links into other files."""
-    minari, h5py = optional("minari"), optional("h5py")
+    minari = optional("minari")
     for path in (source.path / "data").rglob("*.hdf5"):
         if not path.is_file():
             raise BadInputError(f"{path} is a device or a pipe, expected a file")
-        with h5py.File(path, "r") as file:
-            refuse_links(h5py, file, str(source))
-            datasets = stored_datasets(h5py, file)
+        with optional("h5py").File(path, "r") as file:
+            refuse_links(file, str(source))
+            datasets = stored_datasets(file)
             check_storage(datasets, str(source))
             source.refuse_beyond(unpacked_bytes(datasets))
     return minari.MinariDataset(source.path / "data")

@@ -5,7 +5,6 @@ Only tensors are taken, through PyTorch's own restricted reader: nothing of the 
 
 from collections.abc import Iterator
 from pickle import UnpicklingError
-from typing import Any
 from zipfile import ZipFile, is_zipfile
 
 from astra_data.core.errors import BadInputError, optional
@@ -16,17 +15,7 @@ SUFFIXES = (".pt", ".pth")
 
 
 def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
-    """Yield the rows."""
-    tensors = _tensors(source)
-    n = row_count(str(source), mapping.all_fields, {name: value.shape for name, value in tensors.items()})
-    used = {field: tensors[field] for field in mapping.all_fields}
-    source.refuse_beyond(sum(VALUE_BYTES * value.numel() for value in used.values()))
-    if n:
-        yield Block({name: value.numpy() for name, value in used.items()}, str(source), known=tensors)
-
-
-def _tensors(source: Source) -> dict[str, Any]:
-    """Return the tensors of the dictionary in the file, by name; what else it holds is left out."""
+    """Yield the rows of the tensors of the dictionary in the file; what else it holds is left out."""
     torch = optional("torch")
     if not is_zipfile(source.path):
         raise BadInputError(f"{source}: expected a file that torch.save wrote")
@@ -41,8 +30,13 @@ def _tensors(source: Source) -> dict[str, Any]:
         ) from error
     if not isinstance(found, dict):
         raise BadInputError(f"{source}: expected a dictionary of tensors, got {type(found).__name__}")
-    return {
+    tensors = {
         name: value.detach()
         for name, value in found.items()
         if isinstance(name, str) and isinstance(value, torch.Tensor) and value.layout == torch.strided
     }
+    n = row_count(str(source), mapping.all_fields, {name: value.shape for name, value in tensors.items()})
+    used = {field: tensors[field] for field in mapping.all_fields}
+    source.refuse_beyond(sum(VALUE_BYTES * value.numel() for value in used.values()))
+    if n:
+        yield Block({name: value.numpy() for name, value in used.items()}, str(source), known=tensors)

@@ -30,10 +30,9 @@ from astra_data.core.progress import Progress, silent
 from astra_data.core.seeding import derive, generator, held_out_episodes
 from astra_data.dataset import columns as names
 from astra_data.dataset.columns import ABSTRACT_STATE, GOAL, NEXT_STATE, OUTCOME_COLUMNS, STATE, Array, Column, Episode
-from astra_data.dataset.compare import column_faults
 from astra_data.dataset.inspection import outcome_of
 from astra_data.dataset.reader import Dataset
-from astra_data.dataset.versions import next_version, open_dataset
+from astra_data.dataset.versions import column_faults, next_version, open_dataset
 from astra_data.robots.registry import TASKS, task_named
 from astra_data.worlds.geometry import PlanarMap
 from astra_data.worlds.objective import Objective

@@ -12,12 +12,11 @@ from astra_data.core.lazy import Tensor, torch
 from astra_data.core.progress import Progress, silent
 from astra_data.core.seeding import generator
 from astra_data.dataset import columns as names
-from astra_data.dataset.checkup import continuity
+from astra_data.dataset.checkup import continuity, torn_steps
 from astra_data.dataset.columns import Array, Episode
-from astra_data.dataset.compare import column_faults, names_apart
 from astra_data.dataset.inspection import is_terminated, outcome_of
 from astra_data.dataset.reader import Dataset
-from astra_data.dataset.versions import next_version
+from astra_data.dataset.versions import column_faults, names_apart, next_version
 from astra_data.io.hub.sharing import opened
 from astra_data.robots.registry import task_named
 from astra_data.worlds.task import Task
@@ -100,8 +99,8 @@ def _opened(data: str | Path, out: Path | None) -> Dataset:
 
 def remarks(source: Dataset, task: Task) -> list[str]:
     """Say what is to be checked of a dataset that fits a task."""
-    torn = continuity(source.episodes([names.STATE, names.NEXT_STATE]))
-    found = [f"{finding.what}: {finding.advice}" for finding in torn]
+    apart = continuity({one.uid: torn_steps(one) for one in source.episodes([names.STATE, names.NEXT_STATE])})
+    found = [f"{finding.what}: {finding.advice}" for finding in apart]
     if named := names_apart(source, (task.state, task.action), task.name):
         found.append(named)
     has_ends = names.TERMINATED in source.features and names.SUCCESS not in source.features

@@ -14,9 +14,8 @@ from astra_data.core.progress import Progress, Stopwatch, silent
 from astra_data.dataset import columns as keys
 from astra_data.dataset.checkup import TURNS, full_turns
 from astra_data.dataset.columns import Array, in_blocks
-from astra_data.dataset.compare import column_faults, names_apart
 from astra_data.dataset.reader import Dataset
-from astra_data.dataset.versions import next_version, open_dataset
+from astra_data.dataset.versions import column_faults, names_apart, next_version, open_dataset
 from astra_data.robots.registry import TASKS, Pairing, built, checked_abstraction, pairing_named
 from astra_data.worlds.protocols import AbstractSimulator
 from astra_data.worlds.user_code import expect_tensor, explained, stepped

@@ -8,7 +8,8 @@ import pytest
 from damaged import DATA, EPISODES, alter, drop, retype
 from fake_dataset import fake_episodes, write_fake
 
-from astra_data.dataset import Dataset, parquet
+from astra_data.dataset import Dataset
+from astra_data.dataset import format as layout
 from astra_data.dataset.columns import STATE
 from astra_data.dataset.description import Digests, read_digests
 from astra_data.dataset.doctor.salvage import rebuilt_metadata, whole_runs
@@ -24,7 +25,7 @@ def salvaged(root: Path, digests: Digests | None = None) -> tuple[list[int], lis
     notes: list[str] = []
     states = {episode.uid: episode.columns[STATE] for episode in fake_episodes()}
     uids = []
-    for uid, run in whole_runs(root, plain_columns(info["features"])[0], digests or {}, 20, notes):
+    for uid, run in whole_runs(root, plain_columns(info["features"])[0], digests or {}, 20, False, notes):
         np.testing.assert_array_equal(run.columns[STATE], states[uid])
         uids.append(uid)
     return uids, notes
@@ -97,7 +98,7 @@ def test_an_unreadable_row_group_costs_its_episodes_alone(
     *,
     is_digested: bool,
 ) -> None:
-    monkeypatch.setattr(parquet, "GROUP_ROWS", group_rows)
+    monkeypatch.setattr(layout, "GROUP_ROWS", group_rows)
     dataset = write_fake(tmp_path / "set")
     digests = read_digests(dataset.root, dataset.features) if is_digested else None
     deface(dataset.root / DATA, 2 if len(lost) == 1 else 0, column)
@@ -111,7 +112,7 @@ def test_an_unreadable_row_group_costs_its_episodes_alone(
 def test_of_a_shared_row_group_before_the_end_of_a_cut_file_every_episode_is_recovered(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(parquet, "GROUP_ROWS", 30)
+    monkeypatch.setattr(layout, "GROUP_ROWS", 30)
     root = write_fake(tmp_path / "set").root  # episodes 0 to 2, 3, and 4
     path = root / DATA
     metadata = pq.read_metadata(path)

@@ -263,15 +263,15 @@ def test_only_what_the_file_holds_is_taken(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "a.hdf5", "w") as file:
         file["group/x"] = np.zeros((4, 2))
         file.create_dataset("claimed", (10**9,), "f8", chunks=(1000,))
-        datasets = stored_datasets(h5py, file)
+        datasets = stored_datasets(file)
         assert sorted(datasets) == ["claimed", "group/x"] and unpacked_bytes({"x": datasets["group/x"]}) == 64
         check_storage({"x": datasets["group/x"]}, "a.hdf5")
         with pytest.raises(BadInputError, match=r"a.hdf5: field 'claimed' claims the shape"):
             check_storage(datasets, "a.hdf5")
-        refuse_links(h5py, file, "a.hdf5")
+        refuse_links(file, "a.hdf5")
         file["link"] = h5py.SoftLink("/group/x")
         with pytest.raises(BadInputError, match=r"a.hdf5: link: expected no links"):
-            refuse_links(h5py, file, "a.hdf5")
+            refuse_links(file, "a.hdf5")
 
 
 def test_what_was_never_written_is_not_read_as_zeros(tmp_path: Path) -> None:

@@ -12,10 +12,10 @@ from small_run import TASK
 
 from astra_data.cli.sharing import export as export_card
 from astra_data.core.errors import CorruptDatasetError
-from astra_data.dataset.compare import differences
 from astra_data.dataset.edit import filter_episodes, merge, subset
 from astra_data.dataset.inspection import inspect_dataset
 from astra_data.dataset.reader import Dataset
+from astra_data.dataset.versions import differences
 from astra_data.io.exporters import export
 from astra_data.io.hub.sharing import push
 from astra_data.pipeline.stages.augment import AugmentConfig, augment
