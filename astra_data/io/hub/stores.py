@@ -29,7 +29,7 @@ SUMS_PATH = "SHA256SUMS"
 _NUMBERED = r"chunk-[0-9]{3,}/file-[0-9]{3,}\.parquet"
 _PATH = re.compile(
     rf"(data|meta/episodes)/{_NUMBERED}"
-    r"|videos/[A-Za-z0-9_.-]+/chunk-[0-9]{3,}/file-[0-9]{3,}\.mp4"
+    r"|videos/(?!\.\.?/)[\w. -]+/chunk-[0-9]{3,}/file-[0-9]{3,}\.mp4"
     r"|meta/(info\.json|stats\.json|tasks\.parquet)"
     r"|meta/astra/[a-z_]+\.(json|parquet|safetensors)"
 )  # paths of the files of a dataset, by the names of the format; none of them leads out of its folder

@@ -297,10 +297,11 @@ def test_sums_are_those_of_sha256sum(fake: Dataset, tmp_path: Path) -> None:
 
 def test_other_files_in_the_folder_are_left_out(tmp_path: Path) -> None:
     others = ("data/.hidden", "meta/.git/x", "README.md", "notes/a", "data/evil.sh", "meta/evil.json")
-    for path in (*others, DATA, "meta/info.json"):
+    kept = [DATA, "meta/info.json", "videos/front câm/chunk-000/file-000.mp4"]
+    for path in (*others, *kept):
         (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / path).touch()
-    assert dataset_files(tmp_path) == [DATA, "meta/info.json"]
+    assert dataset_files(tmp_path) == kept
 
 
 def test_a_path_that_is_none_of_a_dataset_is_refused() -> None:
@@ -309,6 +310,7 @@ def test_a_path_that_is_none_of_a_dataset_is_refused() -> None:
         *("data\\..\\x", "C:/x", "data/x\0y", "data/~/.ssh", "README.md", ".cache/x", "data/.x", "data/x y"),
         *("data/evil.sh", "data/chunk-000/x.sh", "data/chunk-000/file-000.parquet.py", "meta/astra/x.pkl"),
         *("data/chunk-\u0660\u0660\u0660/file-000.parquet", "meta/evil.json", "meta/astra/a/b.json"),
+        "videos/../chunk-000/file-000.mp4",
     ]
     for path in paths:
         with pytest.raises(SharingError, match="expected one of a dataset's files, within data/, meta/ or videos/"):
