@@ -407,7 +407,7 @@ def _facts(source: Dataset, key: str) -> Sequence[Scalar | None]:
     if key == "length":
         return [int(length) for length in source.lengths]
     found = source.successes() if key == "success" else source.metadata.get(key)
-    if key == "return" and names.REWARD in source.features and found is None:
+    if key == "return" and names.REWARD in source.features and (found is None or None in found):
         return [outcome_of(episode.columns)[key] for episode in source.episodes([names.REWARD])]
     if found is not None:
         return found

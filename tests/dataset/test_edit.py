@@ -155,7 +155,9 @@ def test_filters_that_cannot_work_are_refused(forty: Dataset, tmp_path: Path) ->
 
 
 def test_returns_that_are_not_told_are_sums_of_rewards(tmp_path: Path) -> None:
-    episodes = [Episode(uid, fake_episode(uid, steps).columns) for uid, steps in ((3, 2), (1, 4), (2, 3))]
+    told = {1: {"return": 4.0}}
+    lengths = {3: 2, 1: 4, 2: 3}
+    episodes = [Episode(uid, fake_episode(uid, n).columns, told.get(uid, {})) for uid, n in lengths.items()]
     for episode in episodes:
         episode.columns[REWARD][:] = 1.0
     bare = write_fake(tmp_path / "bare", episodes)
