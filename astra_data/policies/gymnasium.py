@@ -22,6 +22,7 @@ from astra_data.policies.learner import lately, penalty_scale
 from astra_data.policies.simulator_env import SimulatorEnv
 from astra_data.robots.registry import task_named
 from astra_data.worlds.protocols import Step, TargetEnv
+from astra_data.worlds.user_code import expect
 
 Array = NDArray[Any]
 
@@ -89,7 +90,8 @@ class SingleEnv(gymnasium.Env[Array, Array]):
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         """Apply an action (A,) for one control step."""
-        step = self.env.step(torch.tensor(action, dtype=torch.float32)[None])
+        command = expect("action", torch.tensor(action, dtype=torch.float32), (self.env.action_size,))
+        step = self.env.step(command[None])
         self._age += 1
         info = {name: bool(values[0]) for name, values in _facts(self.env, step).items()}
         truncated = self.max_episode_steps is not None and self._age >= self.max_episode_steps
@@ -124,7 +126,8 @@ class BatchedVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
         """Apply actions (B, A) for one control step."""
-        step = self.env.step(torch.tensor(actions, dtype=torch.float32))
+        shape = (self.num_envs, self.env.action_size)  # any other would move each row by all of it
+        step = self.env.step(expect("action", torch.tensor(actions, dtype=torch.float32), shape))
         self._age += 1
         truncated = self._age >= self.max_episode_steps
         done, facts, observation = step.terminated | truncated, _facts(self.env, step), step.observation

@@ -10,6 +10,7 @@ from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env import VecMonitor
 
 import astra_data.envs
+from astra_data.core.errors import BadInputError
 from astra_data.grounding.history import HistoryGrounding, ScatterModel, ScatterShape
 from astra_data.grounding.model import GroundingModel, GroundingShape
 from astra_data.grounding.simulator import NO_GROUNDING
@@ -71,6 +72,15 @@ def test_gymnasiums_own_checks_pass(name: str) -> None:
     assert isinstance(env.unwrapped, SingleEnv) and env.observation_space.shape == ((31,) if "Ant" in name else (8,))
     assert env.action_space == gymnasium.spaces.Box(-1, 1, (2,))
     check_env(env.unwrapped, skip_render_check=True)
+
+
+def test_actions_that_would_be_spread_over_the_rows_are_refused() -> None:
+    env, one = point_mazes(4, 10), gymnasium.make(NAMES[2])
+    env.reset(seed=0), one.reset(seed=0)
+    for action in (np.ones(2), np.ones((4, 1)), np.full((4, 2), np.nan)):
+        for stepped, given in ((env, action), (one, action[0])):
+            with pytest.raises(BadInputError, match=r"^action: expected (finite|shape)"):
+                stepped.step(given)
 
 
 def test_noise_comes_from_the_seed_and_differs_from_step_to_step() -> None:
