@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 from typer.core import TyperArgument, TyperOption
 
-from astra_data.cli import datasets, recipes, sharing
+from astra_data.cli import arguments, datasets, recipes, sharing
 from astra_data.core.durable import NO_FSYNC, disk_error
 from astra_data.core.errors import AstraDataError, BadInputError, missing_extra
 from astra_data.core.naming import in_lines
@@ -102,7 +102,7 @@ TyperOption.display_type = (  # type: ignore[method-assign]
 for panel, commands in PANELS.items():
     for example, command in commands.items():
         epilog = f"Example: astra-data {example}"
-        app.command(example.split()[0], rich_help_panel=panel, epilog=epilog)(command)
+        app.command(example.split()[0], rich_help_panel=panel, epilog=epilog)(arguments.resumable()(command))
 app.add_typer(
     recipes.shipped, name="recipes", help="List or copy the package's recipes and mappings.", rich_help_panel="Recipes"
 )

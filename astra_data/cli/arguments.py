@@ -148,10 +148,9 @@ def run_stage(recipe: Path, stage: str, **options: Any) -> Path:
     options = {name: value for name, value in options.items() if value is not None}
     from astra_data.pipeline.run import run_stage as run
 
-    with resumable():
-        folder = run(recipe, stage, **options)
-        if stage != "report":
-            typer.echo(f"finished: {folder}")
+    folder = run(recipe, stage, **options)
+    if stage != "report":
+        typer.echo(f"finished: {folder}")
     return folder
 
 

@@ -41,8 +41,7 @@ def run(
 
     which: dict[str, Any] = {"methods": methods or (), "seeds": seeds or (), "percents": percents or (), "until": until}
     how: dict[str, Any] = {"jobs": jobs, "device": device, "engine": engine, "address": address}
-    with arguments.resumable():
-        show_made(run_recipe(recipe, **which, root=root, **how), until)
+    show_made(run_recipe(recipe, **which, root=root, **how), until)
 
 
 def check(

@@ -1,5 +1,6 @@
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from typer.testing import CliRunner
@@ -136,12 +137,11 @@ def test_faults_of_all_recipes_are_told(recipe: Path, tmp_path: Path) -> None:
     assert [str(path) in str(result.exception) for path in paths] == [True, False, True]
 
 
-def test_ctrl_c_says_how_to_go_on(recipe: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupted(*_: object, **__: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("astra_data.pipeline.run.digests_of", interrupted)
-    result = CliRunner().invoke(cli.app, ["run", str(recipe), "--root", str(recipe.parent)])
+@pytest.mark.parametrize("command", [["run"], ["select", "--trials", "3"]])
+def test_ctrl_c_says_how_to_go_on(command: list[str], recipe: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for function in ("run.digests_of", "selecting.choose_by_trials"):
+        monkeypatch.setattr(f"astra_data.pipeline.{function}", Mock(side_effect=KeyboardInterrupt))
+    result = CliRunner().invoke(cli.app, [*command, str(recipe)])
     assert result.exit_code == 130 and "run the same command again" in result.output
 
 
