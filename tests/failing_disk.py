@@ -4,6 +4,7 @@ import os
 import resource
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 
 import pytest
 
@@ -30,16 +31,8 @@ def failing(names: str, at: int, error: BaseException, then: BaseException | Non
     Yields the calls, in order.
     """
     calls: list[str] = []
-    with pytest.MonkeyPatch.context() as patch:
-        for name in names.split():
-            patch.setattr(os, name, _counted(name, getattr(os, name), calls, at, error, then))
-        yield calls
 
-
-def _counted(
-    name: str, works: Callable[..., object], calls: list[str], at: int, error: BaseException, then: BaseException | None
-) -> Callable[..., object]:
-    def call(*arguments: object, **options: object) -> object:
+    def counted(name: str, works: Callable[..., object], *arguments: object, **options: object) -> object:
         calls.append(name)
         if len(calls) == at + 1:
             raise error
@@ -47,4 +40,7 @@ def _counted(
             raise then
         return works(*arguments, **options)
 
-    return call
+    with pytest.MonkeyPatch.context() as patch:
+        for name in names.split():
+            patch.setattr(os, name, partial(counted, name, getattr(os, name)))
+        yield calls

@@ -46,54 +46,35 @@ def values(episode: int) -> dict[str, Any]:
     }
 
 
-def add_frames(dataset: Any, episode: int) -> None:
-    columns = values(episode)
-    for frame in range(length(episode)):
-        row = {name: np.atleast_1d(column[frame]) for name, column in columns.items()}
-        dataset.add_frame({**row, "task": task(episode)})
+def add_frames(dataset: Any, columns: dict[str, Any], task: str) -> None:
+    for frame in range(len(columns["action"])):
+        dataset.add_frame({name: np.atleast_1d(column[frame]) for name, column in columns.items()} | {"task": task})
 
 
 def save(dataset: Any, episodes: range) -> None:
     for episode in episodes:
-        add_frames(dataset, episode)
+        add_frames(dataset, values(episode), task(episode))
         dataset.save_episode()
 
 
 def main(folder: Path) -> None:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset  # noqa: PLC0415 - takes seconds
 
-    def create(name: str) -> Any:
-        return LeRobotDataset.create("a/b", FPS, FEATURES, root=folder / name, use_videos=False)
-
-    def whole() -> Any:
-        dataset = create("whole")
-        save(dataset, range(8))
-        dataset.finalize()
+    def record(name: str, finalized: int, later: int = 0) -> Any:
+        dataset = LeRobotDataset.create("a/b", FPS, FEATURES, root=folder / name, use_videos=False)
+        if finalized:
+            save(dataset, range(finalized))
+            dataset.finalize()
+        if finalized and later:
+            dataset = LeRobotDataset.resume("a/b", root=folder / name)
+        save(dataset, range(finalized, finalized + later))
+        if name == "buffered":
+            add_frames(dataset, values(later), task(later))
         return dataset
 
-    def saved() -> Any:
-        dataset = create("saved")
-        save(dataset, range(25))
-        return dataset
-
-    def buffered() -> Any:
-        dataset = create("buffered")
-        save(dataset, range(3))
-        add_frames(dataset, 3)
-        return dataset
-
-    def resumed() -> Any:
-        dataset = create("resumed")
-        save(dataset, range(5))
-        dataset.finalize()
-        dataset = LeRobotDataset.resume("a/b", root=folder / "resumed")
-        save(dataset, range(5, 8))
-        return dataset
-
-    cases: tuple[Callable[[], Any], ...] = (whole, saved, buffered, resumed)
-    for case in cases:
+    for case in (("whole", 8), ("saved", 0, 25), ("buffered", 0, 3), ("resumed", 5, 3)):
         # One import of lerobot for all: each case is a fork that kills itself.
-        assert forked(partial(kill_oneself, case)) == -signal.SIGKILL
+        assert forked(partial(kill_oneself, partial(record, *case))) == -signal.SIGKILL
 
 
 def kill_oneself(case: Callable[[], object]) -> None:

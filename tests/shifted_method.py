@@ -66,26 +66,6 @@ METHOD = Method(
     name="shifted", title="Shifted", fit=lambda fitting: (Shifted(shift_of(fitting)), {}), grounding=Shifted
 )
 LOSSY = Method(name="lossy", title="Lossy", fit=lambda fitting: (Lossy(shift_of(fitting)), {}), grounding=Lossy)
-UNNAMED = replace(LOSSY, grounding=None)
 CLASHING = replace(METHOD, fit=lambda fitting: (Shifted(shift_of(fitting)), {"failures": 3, "machine": ""}))
 WRONG: dict[Any, Any] = {"loss": torch.zeros(()), "r2": [1.0, math.nan], 2: 0.1}
 UNWRITABLE = replace(METHOD, fit=lambda fitting: (Shifted(shift_of(fitting)), WRONG))
-
-
-class NarrowSimulator(ShiftedSimulator):
-    """Forgets all but the first axis."""
-
-    def step(self, action: Tensor) -> Tensor:
-        return super().step(action)[:, :1]
-
-
-class Narrow(Shifted):
-    """Corrects the first axis only."""
-
-    kind = "shifted, narrow"
-
-    def corrected(self, simulator: PlacedSimulator) -> EpisodeSimulator:
-        return NarrowSimulator(simulator, self.shift)
-
-
-NARROW = Method(name="narrow", title="Narrow", fit=lambda fitting: (Narrow(shift_of(fitting)), {}), grounding=Narrow)

@@ -111,10 +111,11 @@ CHECKED = ("quickstart", "cart_sizes", "antmaze_umaze", "ablation", "nao_kick", 
 
 def test_mistakes_and_packaged_recipes_load_nothing_that_takes_seconds(place: Path) -> None:
     recipes = [f"check {RECIPES / name}.toml" for name in CHECKED]
-    command = [sys.executable, str(Path(__file__).parents[1] / "cold_commands.py")]
-    asked = json.dumps([shlex.split(one) for one in (*MISTAKES, *recipes)])
+    command = [sys.executable, str(Path(__file__).parents[1] / "commands.py")]
+    commands = {one: ["astra-data", *shlex.split(one)] for one in (*MISTAKES, *recipes)}
+    asked = json.dumps({"modules": ["astra_data.pipeline.run"], "commands": commands})
     done = subprocess.run(command, input=asked, cwd=place, check=True, capture_output=True, text=True)
-    answered = dict(zip((*MISTAKES, *recipes), json.loads(done.stdout), strict=True))
+    answered = json.loads(done.stdout)
     for mistake, told in MISTAKES.items():
         code, output, loaded = answered[mistake]
         assert code in (1, 2) and told in re.sub(r"\s+", " ", output), f"{mistake}: {output}"

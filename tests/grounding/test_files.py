@@ -1,6 +1,6 @@
 import math
-from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -15,7 +15,9 @@ from astra_data.grounding.alignment import TargetEncoder
 from astra_data.grounding.encoder import take_scales
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.model import GroundingModel, GroundingShape
+from astra_data.grounding.simulator import EpisodeSimulator
 from astra_data.robots.registry import task_named
+from astra_data.worlds.protocols import PlacedSimulator
 
 
 def test_a_history_model_comes_back_frozen(tmp_path: Path) -> None:
@@ -130,64 +132,91 @@ def test_what_is_no_such_pair_is_refused(returned: object, told: str, known: Non
 
 def windows_of(count: int) -> Any:
     """Return episodes that begin on the rail of small_cart.py."""
-
-    class Windows:
-        state, goal, action = (torch.full((count, 5, 1), value) for value in (0.0, 1.0, 0.5))
-
-    class Episodes:
-        windows = Windows
-
-    return Episodes
+    parts = {"state": 0.3, "goal": 1.0, "action": 0.5}
+    return SimpleNamespace(windows=SimpleNamespace(**{name: torch.full((count, 5, 1), v) for name, v in parts.items()}))
 
 
 RAIL = f"{Path(__file__).parents[1] / 'small_cart.py'}:TASK"
 
 
+class Drifting(ShiftedSimulator):
+    """Drifts by the actions of the episode so far."""
+
+    def __init__(self, simulator: PlacedSimulator, shift: torch.Tensor) -> None:
+        super().__init__(simulator, shift)
+        self.drift = torch.zeros_like(simulator.state)
+
+    def start(self, state: torch.Tensor, rows: torch.Tensor, goal: torch.Tensor, **before: Any) -> None:
+        super().start(state, rows, goal, **before)
+        self.drift = self.drift.index_fill(0, rows, 0.0)
+
+    def step(self, action: torch.Tensor) -> torch.Tensor:
+        self.drift = self.drift + 0.1 * action
+        return self._settle(self.state, self.simulator.step(action) + self.drift + self.shift)
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        return super().state_dict() | {"drift": self.drift}
+
+    def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
+        super().load_state_dict(state)
+        self.drift = state["drift"].clone()
+
+
+STEP = Drifting.step
+START: Any = EpisodeSimulator.start
+NOISE = torch.Generator()
+UNCORRECTED = r"go on uncorrected: expected `return self._settle\(before, corrected\)`"
+
+
 @pytest.mark.parametrize(
-    ("landed", "told"),
+    ("changed", "told"),
     [
+        ({"step": lambda self, action: STEP(self, action)[:, :0]}, r"step: expected shape \(2, 1\), got \(2, 0\)"),
+        ({"step": lambda self, action: STEP(self, action).double()}, "step: expected torch.float32, got torch.float64"),
         (
-            lambda self, action: self.simulator.step(action)[:, :0],
-            r"expected states, torch.float32 of shape \(2, 1\), got torch.float32 of shape \(2, 0\)",
+            {"step": lambda self, action: self.simulator.step(action) + 1e-5},
+            rf"step: returned .* 1\S*e-05 .*{UNCORRECTED}",
+        ),
+        ({"start": START}, "start: after other steps, .* ends .* elsewhere: expected `super"),
+        ({"start": lambda self, *_, **__: None}, "start: after other steps, the same episode ends .* elsewhere"),
+        (
+            {"start": lambda self, *given, **_: (START(self, *given), self.drift.zero_())},
+            "start: to start row 0 moves row 1 by .*: expected changes of `rows` alone",
         ),
         (
-            lambda self, action: self.simulator.step(action).double(),
-            r"expected states, torch.float32 of shape \(2, 1\), got torch.float64 of shape \(2, 1\)",
+            {"state_dict": lambda self: {"drift": self.drift, "n": 2}},
+            "state_dict: n: expected a torch tensor, got a int",
         ),
+        ({"load_state_dict": EpisodeSimulator.load_state_dict}, "state_dict: resumed from it, steps end .* elsewhere"),
         (
-            lambda self, action: self.simulator.step(action)[:1],
-            r"expected states, torch.float32 of shape \(2, 1\), got torch.float32 of shape \(1, 1\)",
+            {"step": lambda self, action: STEP(self, action + torch.rand((), generator=NOISE))},
+            "state_dict: resumed .*, and draws from torch's generator",
         ),
-        (lambda self, action: None, "expected a torch tensor, got a NoneType"),
+        ({"latent_size": 3}, "latent with latent_size = 3: expected a torch tensor, got a NoneType"),
+        ({"latent": torch.zeros(2, 3), "latent_size": 3}, r"encoder: expected ψ\^s, whose latents policies see on"),
+        (
+            {"hidden_before": lambda *_: torch.zeros(4, 5, 1)},
+            r"hidden_before: expected shape \(4, 3, any\), got \(4, 5, 1",
+        ),
     ],
 )
-def test_a_step_that_is_no_states_is_refused(
-    landed: Callable[..., object], told: str, monkeypatch: pytest.MonkeyPatch
+def test_a_simulator_that_a_training_would_not_run_as_it_is_meant_is_refused(
+    changed: dict[str, Any], told: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(ShiftedSimulator, "step", landed)
-    with pytest.raises(BadInputError, match=f"^ShiftedSimulator.step: {told}$"):
+    monkeypatch.setattr(Shifted, "corrected", lambda self, simulator: Drifting(simulator, self.shift))
+    monkeypatch.setattr(Shifted, "start_stride", 2)
+    files.check_step(task_named(RAIL), SHIFTED, SHIFTED, windows_of(4))
+    for name, value in changed.items():
+        monkeypatch.setattr(Shifted if "hidden" in name else Drifting, name, value)
+    with pytest.raises(BadInputError, match=rf"^(Drifting|Shifted)\.{told}"):
         files.check_step(task_named(RAIL), SHIFTED, SHIFTED, windows_of(4))
-
-
-@pytest.mark.parametrize("shift_m", [0.01, 1e-5])
-def test_a_step_that_leaves_its_simulator_uncorrected_is_refused(
-    shift_m: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(ShiftedSimulator, "step", lambda self, action: self.simulator.step(action) + self.shift)
-    told = (
-        rf"^ShiftedSimulator.step: returned states up to {shift_m:.3g}\d* from its simulator's, which would "
-        r"go on uncorrected: expected `return self._settle\(before, corrected\)`"
-    )
-    with pytest.raises(BadInputError, match=told):
-        shifted = Shifted(torch.tensor([shift_m]))
-        files.check_step(task_named(RAIL), shifted, shifted, windows_of(4))
 
 
 def test_what_is_not_restored_as_it_was_or_not_finite_is_refused(tmp_path: Path) -> None:
     whole, lost = Shifted(torch.tensor([0.01])), Shifted(torch.tensor([0.0]))
     files.check_step(task_named(RAIL), whole, whole, windows_of(4))
     with pytest.raises(
-        BadInputError, match=r"^Shifted\.from_file: steps of what it returns end up to 0\.01 from those"
+        BadInputError, match=r"^Shifted\.from_file: steps of what it returns end up to 0\.05 from those"
     ):
         files.check_step(task_named(RAIL), whole, lost, windows_of(4))
     with pytest.raises(BadInputError, match=r"^fit returned a Shifted with NaN or infinity in shift: expected finite"):

@@ -20,7 +20,7 @@ from astra_data.dataset.doctor.check import check
 from astra_data.dataset.doctor.repair import repair
 from astra_data.dataset.reader import Dataset
 
-WARM = Path(__file__).parents[1] / "warm_commands.py"
+COMMANDS = Path(__file__).parents[1] / "commands.py"
 LOADED = [f"lerobot.scripts.lerobot_{name}" for name in ("train", "edit_dataset")]
 TRAINING_STEPS = 2
 
@@ -71,14 +71,14 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Runs:
         "PYTHONWARNINGS": "ignore",
     }
     done = subprocess.run(
-        [sys.executable, WARM],
+        [sys.executable, COMMANDS],
         input=json.dumps({"modules": LOADED, "commands": commands}),
         env=os.environ | settings,
         capture_output=True,
         text=True,
         check=True,
     )
-    results = {name: (code, shown) for name, (code, shown) in json.loads(done.stdout).items()}
+    results = {name: (code, shown) for name, (code, shown, _) in json.loads(done.stdout).items()}
     return Runs(dataset, folder, results)
 
 

@@ -124,9 +124,7 @@ def test_the_time_is_that_of_the_whole_stage(
 @pytest.mark.parametrize(
     ("method", "told"),
     [
-        ("UNNAMED", "expected grounding=Lossy"),
         ("LOSSY", r"^Lossy\.from_file: steps of what it returns end up to"),
-        ("NARROW", "got"),
         ("CLASHING", "^the figures of fit: machine: .*; failures: .*: expected .* other names than those of reports"),
         (
             "UNWRITABLE",
