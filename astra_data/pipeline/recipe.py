@@ -1,7 +1,7 @@
 """The model of recipes, their files, and the methods of the user's: task, rows, seeds, sizes, tables of settings."""
 
 import os
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Self
 
@@ -23,7 +23,6 @@ from astra_data.dataset.edit import share
 from astra_data.dataset.format import INFO_PATH
 from astra_data.io.mapping import refuse_mapping
 from astra_data.methods import METHODS, add_method, is_of_package, method_named, offered_methods, tables
-from astra_data.methods.method import Table
 from astra_data.pipeline.shipped import whereabouts
 from astra_data.pipeline.stages.registry import STAGES, Stage
 from astra_data.pipeline.stages.select import judge_of
@@ -184,7 +183,7 @@ class SweepConfig(Config):
 class Recipe(Config):
     """One experiment: which methods, on which task, with which seeds and settings.
 
-    Below `seeds` come a table for each stage, `based_on`, `sweep`, and the methods' tables; see `with_tables`.
+    Below `seeds` come a table for each stage, `based_on`, `sweep`, and the methods' tables: `_FIELDS`.
     """
 
     task: str
@@ -332,16 +331,10 @@ class Recipe(Config):
         return max(self.sweep.percent, default=WHOLE)
 
 
-def with_tables(base: type[Recipe], stages: Iterable[Stage], methods: Iterable[Table]) -> type[Recipe]:
-    """Return the model of recipes with the tables of `stages` and those that `methods` read, `based_on` and `sweep`."""
-    fields: dict[str, Any] = {stage.name: _stage_field(stage) for stage in stages if stage.config}
-    about = "The recipe of the settings that are not given here, and of the artifacts that do not change."
-    fields["based_on"] = (str | None, Field(default=None, description=about))
-    fields["sweep"] = (SweepConfig, SweepConfig())
-    for table in methods:
-        fields[table.name] = (table.model, table.model())
-    return create_model(base.__name__, __base__=base, __module__=base.__module__, **fields)
-
-
+_ABOUT = "The recipe of the settings that are not given here, and of the artifacts that do not change."
+_FIELDS: dict[str, Any] = {stage.name: _stage_field(stage) for stage in STAGES.values() if stage.config}
+_FIELDS["based_on"] = (str | None, Field(default=None, description=_ABOUT))
+_FIELDS["sweep"] = (SweepConfig, SweepConfig())
+_FIELDS |= {name: (table.model, table.model()) for name, table in tables().items()}
 if not TYPE_CHECKING:
-    Recipe = with_tables(Recipe, STAGES.values(), tables().values())
+    Recipe = create_model(Recipe.__name__, __base__=Recipe, __module__=__name__, **_FIELDS)

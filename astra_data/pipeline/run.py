@@ -96,18 +96,13 @@ def run(
     items = [item for item in planned if item.stage in wanted]
     make(experiment, items, planned, part, jobs=jobs, device=device, engine=engine, address=address)
     if "ground" in wanted:
-        write_errors(experiment, part)
+        rows, task = [*part.methods, reference_of(experiment.recipe.methods)], task_named(experiment.recipe.task)
+        groundings = dict.fromkeys(grounded_as(row) for row in rows if row and method_named(row).grounds)
+        of = replace(part, methods=tuple(groundings))
+        write_held_out(recipe_path.stem, experiment.folder, of, timestep_s=task.timestep_s)
     if until in ("pair", "ground"):
         write_diagnosis(experiment, part)
     return experiment.folder
-
-
-def write_errors(experiment: Experiment, part: Selection) -> Path | None:
-    """Write the page of held-out errors of the groundings that `part` needs; return it, None if none."""
-    rows = [*part.methods, reference_of(experiment.recipe.methods)]
-    groundings = dict.fromkeys(grounded_as(row) for row in rows if row and method_named(row).grounds)
-    of, timestep_s = replace(part, methods=tuple(groundings)), task_named(experiment.recipe.task).timestep_s
-    return write_held_out(experiment.path.stem, experiment.folder, of, timestep_s=timestep_s)
 
 
 def write_diagnosis(experiment: Experiment, part: Selection) -> None:

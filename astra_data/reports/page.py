@@ -183,7 +183,7 @@ def _comparisons(results: Results) -> Iterator[Block]:
     scores = {row: np.array([*results.values(row, headline.measure).values()]) for row in rows}
     for row, other in permutations(rows, 2):
         is_alike = is_plus(other) == is_plus(row) or not results.values(other, "success", SIMULATED)
-        if base_method(row) in results.compare and is_alike:
+        if base_method(row) in map(base_method, results.compare) and is_alike:
             better = probability_of_improvement(scores[row], scores[other])
             if better and (by := results.difference(row, other)):
                 shown = (interval(better), interval(by, headline.digits))

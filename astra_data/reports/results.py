@@ -377,7 +377,7 @@ def elapsed_seconds(results: Results) -> float:
 def stage_seconds(results: Results, clock: str) -> dict[str, float]:
     """Return the time of each stage over all of its artifacts, by "wall_seconds" or "cpu_seconds"."""
     known = [(line.where, line.values[clock]) for line in results.lines if clock in line.values]
-    return {stage: sum(seconds for of, seconds in known if of == stage) for stage, _ in known}
+    return {stage: sum(seconds for of, seconds in known if of == stage) for stage in dict(known)}
 
 
 def read_results(path: Path) -> Results:

@@ -16,11 +16,13 @@ from astra_data.dataset.edit import filter_episodes, subset
 from astra_data.dataset.reader import Dataset
 from astra_data.io.importing import import_dataset
 from astra_data.pipeline.experiment import condition, load_experiment
-from astra_data.pipeline.plan import plan, selected
-from astra_data.pipeline.run import check, set_aside, write_errors
+from astra_data.pipeline.plan import plan
+from astra_data.pipeline.run import check, set_aside
 from astra_data.pipeline.stages.label import label
 from astra_data.pipeline.trained_policy import load_policy
 from astra_data.reports.artifacts import EVALUATION, Evaluation, read_json
+from astra_data.reports.held_out import write_held_out
+from astra_data.reports.runs import Selection
 
 pytestmark = pytest.mark.usefixtures("quick_fits")
 CART = Path(__file__).parents[2] / "recipes/examples/cart"
@@ -72,8 +74,7 @@ def test_held_out_errors_say_how_much_data_is_enough(cart: Path) -> None:
     text = 'methods = ["nas"]\n[sweep]\npercent = [50, 100]\n'
     folder, keys = made(cart, "sizes", text, lambda key: key.split("/")[0] in until)
     assert "subset/percent_050/seed_0" in keys and len(Dataset.open(folder / "subset/percent_050/seed_0")) == 4
-    experiment = load_experiment(cart / "sizes.toml", cart / "runs")
-    page = write_errors(experiment, selected(experiment.recipe))
+    page = write_held_out("sizes", folder, Selection(("nas",), (0,), (50, 100)), timestep_s=0.1)
     assert page is not None
     lines = page.read_text().splitlines()
     gap = json.loads((folder / "ground/nas/percent_050/seed_0/gap.json").read_text())

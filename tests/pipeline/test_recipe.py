@@ -5,12 +5,10 @@ from typing import Any
 
 import pytest
 
-from astra_data.core.config import Config, validated
+from astra_data.core.config import validated
 from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.methods.iql import IqlConfig
-from astra_data.methods.method import Table
-from astra_data.pipeline.recipe import Recipe, read_tables, recorded_settings, with_tables
-from astra_data.pipeline.stages.registry import STAGES
+from astra_data.pipeline.recipe import Recipe, read_tables, recorded_settings
 from astra_data.policies.train import PpoTrainConfig, SacTrainConfig, TargetConfig
 
 BASE = {"task": "humanoid-walker2d", "methods": ["direct_transfer"], "seeds": [0]}
@@ -26,18 +24,6 @@ def test_the_learner_decides_what_the_training_is_told() -> None:
     recipe = read(train=SAC | {"window": 24})
     assert isinstance(recipe.train, SacTrainConfig) and recipe.train.window == 24
     assert read(**recipe.settings) == recipe
-
-
-class MyConfig(Config):
-    rate: float = 0.5
-
-
-def test_the_table_of_a_new_method_is_read() -> None:
-    model = with_tables(Recipe, STAGES.values(), [Table("mine", MyConfig), Table("yours", MyConfig)])
-    recipe = validated(BASE | {"mine": {"rate": 0.7}}, model, "r.toml")
-    assert recipe.mine == MyConfig(rate=0.7) and recipe.yours == MyConfig()
-    with pytest.raises(RecipeError, match=r"mine\.rat: unknown key: did you mean 'rate'"):
-        validated(BASE | {"mine": {"rat": 0.7}}, model, "r.toml")
 
 
 def test_settings_are_those_of_the_rows_method_for_the_stage_that_takes_them() -> None:

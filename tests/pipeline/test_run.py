@@ -6,6 +6,7 @@ import re
 import shutil
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from fake_runs import edit_json, line, results
@@ -145,6 +146,13 @@ def test_a_diagnosis_of_other_pairs_does_not_stay(recipe: Path, folder: Path, ca
     (folder / "diagnosis.md").touch()
     run(recipe, root=recipe.parent, until="pair")
     assert "diagnosis.md is not written: " in caplog.text and not (folder / "diagnosis.md").exists()
+
+
+def test_the_page_of_errors_is_of_what_rows_and_tests_need(recipe: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("astra_data.pipeline.run.write_held_out", written := Mock())
+    recipe.write_text(HEAD.replace('"astra_plus"', '"nas", "direct_transfer"'))
+    run(recipe, methods=["astra", "direct_transfer"], root=recipe.parent, until="ground")
+    assert written.call_args.args[2].methods == ("astra", "nas")
 
 
 def test_altered_bytes_are_found_where_a_step_reads_them(recipe: Path, folder: Path, stages: FakeStages) -> None:
