@@ -325,7 +325,8 @@ class ClipWriter:
                 packet.dts = (packet.pts if packet.dts is None else packet.dts) + offset
                 packet.pts += offset
                 packet.stream = self._stream
-                self._mux(packet)
+                self._bytes += packet.size
+                self._output.mux(packet)
                 left -= 1
                 if not left:
                     break
@@ -348,12 +349,9 @@ class ClipWriter:
             frame.pts, frame.time_base = number + count, Fraction(1, self._fps)
             frame.pict_type = 1 if count == 0 else 0  # each clip begins with a key frame
             for packet in self._stream.encode(frame):
-                self._mux(packet)
+                self._bytes += packet.size
+                self._output.mux(packet)
         return Span(self._file, from_s, self._time_s)
-
-    def _mux(self, packet: Any) -> None:  # noqa: ANN401 - of PyAV
-        self._bytes += packet.size
-        self._output.mux(packet)
 
     def _open(self, kind: object) -> None:
         """Go on in this file, or begin another where the codec is another or it is full."""

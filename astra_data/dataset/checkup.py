@@ -261,7 +261,11 @@ def check_up(dataset: Dataset, called: str | None = None) -> Checkup:
         if STATE in columns:
             state = as_rows(episode.columns[STATE])
             doubled.append(repeated(state))
-            motions += [_motion(episode.uid, state)] if len(state) >= FEWEST_STEPS else []
+            if len(state) >= FEWEST_STEPS:
+                changes, ends = state[1:] != state[:-1], (state.min(axis=0), state.max(axis=0))
+                low, high = (end.astype(np.float64) for end in ends)
+                moves = bool(changes.any(axis=1).mean() > STUCK)
+                motions.append((episode.uid, longest_rests(changes) / len(changes), low, high, moves))
             apart |= {episode.uid: torn_steps(episode)} if NEXT_STATE in columns else {}
     # What the import said of rates and of rounding, where the dataset is one.
     notes, topics = (dataset.description.get(key) for key in ("notes", "topics"))
@@ -370,12 +374,6 @@ def stuck(column: Column, motions: Sequence[_Motion], called: str) -> list[Findi
     indices, where = np.flatnonzero(found.any(axis=0)).tolist(), uids[found.any(axis=1)].tolist()
     what = f"stuck for over half of an episode while others move: {channels(column, indices)}"
     return [Finding("warning", what, f"leave them out: {deletion(called, where)}", tuple(where))] if where else []
-
-
-def _motion(uid: int, state: Array) -> _Motion:
-    changes = state[1:] != state[:-1]
-    low, high = (extreme.astype(np.float64) for extreme in (state.min(axis=0), state.max(axis=0)))
-    return uid, longest_rests(changes) / len(changes), low, high, bool(changes.any(axis=1).mean() > STUCK)
 
 
 def longest_rests(changes: Bools) -> Ints:

@@ -174,8 +174,12 @@ def merge(
     # Episodes have tasks of their own where there are several.
     of_episodes = [(source.task, task) for source in sources for task in source.metadata.get("task", [None])]
     tasks = list(dict.fromkeys(usual if task is None else str(task) for usual, task in of_episodes))
-    each = zip(sources, _merged_uids(sources, new_uids), strict=True)
-    renamed = (_renamed(one, source, uids, len(tasks) > 1) for source, uids in each for one in source.episodes())
+    renamed = (
+        replace(one, uid=uids[one.uid], metadata=task | renamed_metadata(one.uid, one.metadata, uids))
+        for source, uids in zip(sources, _merged_uids(sources, new_uids), strict=True)
+        for task in [{"task": source.task} if len(tasks) > 1 else {}]
+        for one in source.episodes()
+    )
     config = {"datasets": [source.reference for source in sources], "new_uids": new_uids}
     described: dict[str, Any] = {"stage": "merge", "config": config, "name": name, "out": out}
     parents = [other.identity for other in others]
@@ -247,11 +251,14 @@ def resample(source: Dataset, fps: int, *, name: str | None = None, out: Path | 
             f"divides {source.info['fps']}, got {fps}"
         )
     schema = [column for column in source.schema if not column.name.startswith("abstract.")]
-    turns = [(column, _turns(column, source)) for column in schema]
-    slower = (slow for episode in source.episodes() if (slow := _resampled(episode, turns, source.info["fps"], fps)))
+    turns = {column.name: (column, _turns(column, source)) for column in schema}
+    if {names.STATE, names.NEXT_STATE} <= turns.keys():  # next states are states, whatever is known of their own angles
+        state, angles = turns[names.STATE]
+        turns[names.NEXT_STATE] = replace(state, name=names.NEXT_STATE), angles
+    each = (_resampled(episode, [*turns.values()], source.info["fps"], fps) for episode in source.episodes())
     config = {"fps": fps, "from_fps": source.info["fps"]}
     described: dict[str, Any] = {"stage": "resample", "config": config, "name": name, "out": out}
-    made = _write(source, "columns", slower, schema=schema, fps=fps, **described)
+    made = _write(source, "columns", filter(None, each), schema=schema, fps=fps, **described)
     if paired := [column.name for column in source.schema if column not in schema]:
         _log.warning("left out, since steps of another length land elsewhere: %s; pair it again", ", ".join(paired))
     return made
@@ -373,13 +380,6 @@ def _interpolated(values: Floats, at: Floats, column: Column, turns: _Turns) -> 
             least = 0.0 if recorded[:, index].min() >= 0.0 else -turn / 2
             found[:, index] = (found[:, index] - least) % turn + least
     return np.asarray(found)
-
-
-def _renamed(episode: Episode, source: Dataset, uids: Mapping[int, int], has_task: bool) -> Episode:
-    """Return an episode of `source` under its new uid, with its task."""
-    metadata = {"task": source.task} if has_task else {}
-    metadata |= renamed_metadata(episode.uid, episode.metadata, uids)
-    return replace(episode, uid=uids[episode.uid], metadata=metadata)
 
 
 def _write(source: Dataset, change: Change, episodes: Iterable[Episode], **described: Any) -> Path:

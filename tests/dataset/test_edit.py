@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fake_dataset import COLUMNS, DESCRIPTION, LENGTHS, assert_same, fake_episode, write_fake, writer
+from fake_dataset import COLUMNS, DESCRIPTION, LENGTHS, assert_same, fake_episode, write_fake, write_transitions, writer
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import (
@@ -399,6 +399,12 @@ def test_states_at_another_rate_are_where_the_robot_was(
     assert episode.columns[REWARD].sum() == recorded == episode.metadata["return"]
     assert episode.columns[TERMINATED].tolist() == [*[False] * (len(episode) - 1), True]
     assert "abstract.state" not in found.features and caplog.messages[-1].endswith("abstract.state; pair it again")
+
+
+def test_next_states_are_the_states_after_them_whatever_is_known_of_their_angles(tmp_path: Path) -> None:
+    source = write_transitions(tmp_path / "set")  # of which the states alone have roles
+    for one in made(resample(source, 30, out=tmp_path / "fast")):
+        np.testing.assert_array_equal(one.columns[NEXT_STATE][:-1], one.columns[STATE][1:])
 
 
 def test_rewards_and_endings_are_those_of_all_steps_within(tmp_path: Path) -> None:

@@ -21,19 +21,15 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     with source.open() as stream, pq.ParquetFile(stream) as file:
         shapes = dict.fromkeys(file.schema_arrow.names, (file.metadata.num_rows,))
         row_count(str(source), fields, shapes)
-        source.refuse_beyond(VALUE_BYTES * _values_of(file.metadata, set(fields)))
+        groups = [file.metadata.row_group(number) for number in range(file.num_row_groups)]
+        chunks = [group.column(number) for group in groups for number in range(file.metadata.num_columns)]
+        paths = tuple(f"{field}." for field in fields)  # compressed zeros take hardly any bytes: values are counted
+        held = sum(chunk.num_values for chunk in chunks if f"{chunk.path_in_schema}.".startswith(paths))
+        source.refuse_beyond(VALUE_BYTES * held)
         table = file.read(fields)
     if table.num_rows:
         values = {field: _array(table.column(field).combine_chunks(), f"{source}: field '{field}'") for field in fields}
         yield Block(values, str(source), known=file.schema_arrow.names)
-
-
-def _values_of(metadata: pq.FileMetaData, fields: set[str]) -> int:
-    """Return how many values the columns hold; compressed zeros take hardly any bytes."""
-    groups = [metadata.row_group(number) for number in range(metadata.num_row_groups)]
-    chunks = [group.column(number) for group in groups for number in range(metadata.num_columns)]
-    paths = tuple(f"{field}." for field in fields)
-    return sum(chunk.num_values for chunk in chunks if f"{chunk.path_in_schema}.".startswith(paths))
 
 
 def _array(column: pa.Array, origin: str) -> Array:
