@@ -164,6 +164,7 @@ def with_own_rewards(task: Task, episodes: PairedEpisodes) -> PairedEpisodes:
     before, after, goal = (values.flatten(0, 1) for values in (windows.state, windows.next_state, windows.goal))
     shown = objective.decided(after, goal)
     own = objective.reward(before, after, goal, torch.zeros_like(shown)).reshape(windows.mask.shape)
+    own = torch.where(windows.mask.bool(), own, 0.0)  # a user's reward need not know what padding is
     open_ended = ~shown.reshape(windows.mask.shape)
     goes_on, failed = windows.goes_on * open_ended, windows.failed * open_ended
     return replace(episodes, windows=replace(windows, own_reward=own, goes_on=goes_on, failed=failed))

@@ -14,6 +14,7 @@ from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.model import GroundingModel, GroundingShape, LossWeights
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.robots.registry import TASKS
+from astra_data.worlds.plane.navigation import Navigation
 from astra_data.worlds.task import Task
 
 
@@ -155,6 +156,14 @@ def test_residuals_are_learned_by_default_and_the_whole_reward_as_printed(
         assert metrics["reward_shrinkage"] == float(model.reward_shrinkage)
         model.shrink_reward(held_out)
         assert metrics["reward_shrinkage"] == float(model.reward_shrinkage)
+
+
+def test_what_a_reward_says_of_padding_does_not_matter(monkeypatch: pytest.MonkeyPatch) -> None:
+    given = episodes(0)
+    monkeypatch.setattr(Navigation, "reward", lambda self, before, after, goal, failed: 1.0 / after.norm(dim=-1))
+    windows = replace(given.windows, next_state=given.windows.next_state * given.windows.mask.unsqueeze(-1))
+    own = with_own_rewards(TASK, replace(given, windows=windows)).windows.own_reward
+    assert own is not None and own.isfinite().all() and torch.equal(own > 0, windows.mask.bool())
 
 
 def test_it_returns_to_the_weights_with_the_least_held_out_error(
