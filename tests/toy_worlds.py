@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from astra_data.core.checkpoint import resumed, save_state
+from astra_data.core.checkpoint import Logbook
 from astra_data.policies.learner import Learner
 from astra_data.worlds.protocols import Step
 
@@ -138,10 +138,11 @@ def train(learner: Learner) -> list[dict[str, float]]:
 
 def came_back(state: dict[str, Any]) -> dict[str, Any]:
     """Return what a training that resumes from `state` is given."""
+    read: dict[str, Any] = {}
     with TemporaryDirectory() as folder:
-        save_state(Path(folder) / "checkpoint.pt", state, {})
-        with resumed(Path(folder) / "checkpoint.pt") as (read, _):
-            return read
+        Logbook(Path(folder) / "checkpoint.pt", read.update).keep(state)
+        Logbook(Path(folder) / "checkpoint.pt", read.update)
+    return read
 
 
 def assert_resumes(begin: Callable[[], Any], learned: str = "policy") -> None:

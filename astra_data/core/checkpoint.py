@@ -59,27 +59,6 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     return tensors, metadata
 
 
-def save_state(checkpoint: Path, state: Mapping[str, Any], metadata: Mapping[str, Any]) -> None:
-    """Write the state of a training, tensors and numbers in containers, and `metadata` (JSON values), for `resumed`."""
-    data = BytesIO()
-    torch.save({"state": state, "metadata": json.dumps(metadata)}, data)
-    write_file(checkpoint, data.getvalue())
-
-
-@contextmanager
-def resumed(checkpoint: Path) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
-    """Yield the state and the metadata that `save_state` wrote; the block resumes from them."""
-    try:
-        found = torch.load(checkpoint, map_location="cpu", weights_only=True)
-    except (EOFError, RuntimeError, UnpicklingError) as error:
-        raise BadInputError(f"{checkpoint} is not a complete checkpoint: remove {checkpoint.parent}") from error
-    try:
-        yield found["state"], json.loads(found["metadata"])
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        expected = f"expected a checkpoint of this version, found something else ({error})"
-        raise BadInputError(f"{checkpoint}: {expected}: remove {checkpoint.parent}") from error
-
-
 def not_finite(tensors: Mapping[str, Tensor]) -> str:
     """Say which weights are not finite; an infinite deviation is how networks leave out a part of their input."""
     wrong = {name: one.isnan() if name.endswith("_std") else ~one.isfinite() for name, one in tensors.items()}
@@ -119,6 +98,11 @@ def part_of(tensors: Mapping[str, Tensor], part: str) -> dict[str, Tensor]:
     return {name.removeprefix(prefix): one for name, one in tensors.items() if name.startswith(prefix)}
 
 
+def of_json[Shape](shape: type[Shape], sizes: Mapping[str, Any]) -> Shape:
+    """Return the sizes of networks as they were before JSON made lists of tuples."""
+    return shape(**{key: tuple(value) if isinstance(value, list) else value for key, value in sizes.items()})
+
+
 def loaded[Module: torch.nn.Module](model: Module, weights: Mapping[str, Tensor], device: str = "cpu") -> Module:
     """Return `model` with these weights, on `device`, frozen and out of training."""
     model.load_state_dict(weights)
@@ -133,9 +117,17 @@ class Logbook:
         self._checkpoint = checkpoint
         self.points, spent = list[dict[str, Any]](), None
         if checkpoint and checkpoint.exists():
-            with resumed(checkpoint) as (state, metadata):
-                go_on(state)
+            try:
+                found = torch.load(checkpoint, map_location="cpu", weights_only=True)
+            except (EOFError, RuntimeError, UnpicklingError) as error:
+                raise BadInputError(f"{checkpoint} is not a complete checkpoint: remove {checkpoint.parent}") from error
+            try:
+                metadata = json.loads(found["metadata"])
+                go_on(found["state"])
                 self.points, spent = metadata["points"], metadata["spent"]
+            except (KeyError, TypeError, ValueError, RuntimeError) as error:
+                expected = f"expected a checkpoint of this version, found something else ({error})"
+                raise BadInputError(f"{checkpoint}: {expected}: remove {checkpoint.parent}") from error
         self.stopwatch, self._kept = Stopwatch(spent), time.perf_counter()
 
     @property
@@ -144,8 +136,9 @@ class Logbook:
         return time.perf_counter() - self._kept >= CHECKPOINT_SECONDS
 
     def keep(self, state: Mapping[str, Any]) -> None:
-        """Write a checkpoint: `state` (see `save_state`), the points and the time spent."""
+        """Write a checkpoint: `state`, tensors and numbers in containers, the points and the time spent."""
         if self._checkpoint is not None:
-            metadata = {"points": self.points, "spent": self.stopwatch.spent()}
-            save_state(self._checkpoint, state, metadata)
+            data, metadata = BytesIO(), {"points": self.points, "spent": self.stopwatch.spent()}
+            torch.save({"state": state, "metadata": json.dumps(metadata)}, data)
+            write_file(self._checkpoint, data.getvalue())
         self._kept = time.perf_counter()

@@ -11,9 +11,9 @@ def silent(fraction: float, note: str) -> None:
     """Report nothing."""
 
 
-def part(progress: Progress, begin: float, end: float) -> Progress:
-    """Return the progress of a part of the job that covers the fractions `begin` to `end` of the whole."""
-    return lambda fraction, note: progress(begin + (end - begin) * fraction, note)
+def part(progress: Progress, begin: float, end: float, which: str = "") -> Progress:
+    """Return the progress of the part `which` of the job, that covers the fractions `begin` to `end` of the whole."""
+    return lambda fraction, note: progress(begin + (end - begin) * fraction, which + note)
 
 
 class Stopwatch:
