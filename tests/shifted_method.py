@@ -9,9 +9,8 @@ import torch
 from torch import Tensor
 
 from astra_data.grounding.fit import Fitting
-from astra_data.grounding.simulator import EpisodeSimulator, FittedGrounding
+from astra_data.grounding.simulator import EpisodeSimulator, FittedGrounding, PlacedSimulator
 from astra_data.methods.method import Method
-from astra_data.worlds.protocols import PlacedSimulator
 
 SHIFT_M = 0.01
 

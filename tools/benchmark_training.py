@@ -37,7 +37,7 @@ from astra_data.policies import ppo as proximal
 from astra_data.policies.networks import ActorCritic, PolicyShape
 from astra_data.policies.simulator_env import SimulatorEnv
 from astra_data.policies.train import PpoTrainConfig
-from astra_data.robots.ant.tasks import POSITIONS, VelocityController
+from astra_data.robots.ant.tasks import VelocityController
 from astra_data.robots.registry import TASKS
 
 SETTINGS = load_recipe(Path(__file__).parents[1] / "recipes" / "antmaze_long.toml", Recipe)
@@ -221,7 +221,7 @@ class DrivenAnt(gymnasium.ActionWrapper[Any, Any, Any]):
 
     def action(self, action: Any) -> Any:  # noqa: ANN401
         """Return the torques (8,)."""
-        qpos, qvel = self._data.qpos[None, :POSITIONS], self._data.qvel[None]
+        qpos, qvel = self._data.qpos[None, :15], self._data.qvel[None]
         return self._controller(qpos, qvel, action[None])[0]
 
 

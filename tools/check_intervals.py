@@ -32,7 +32,7 @@ def outcomes(run: Path) -> list[tuple[Values, Values, int]]:
     (recipe, config), found = asked_of(run), []
     for one in (judged := select(run)).candidates:
         policy, first = trained_policy(run, one.row, seed=one.seed).running(), list[Tensor]()
-        outcome = in_target(policy.task, partial(_begun, policy, first), STARTS, derive(one.seed, "check")).outcome
+        outcome = in_target(policy.task, partial(_begun, policy, first), STARTS, derive(one.seed, "check"))
         success, predicted = np.array(outcome.success), np.array(predicted_from(recipe, config, one, *first, root=run))
         found.append((success, predicted, judged.episodes * len(one.success)))
         print(f"{run.name}: {one.name}: {success.mean():.2f}, predicted {predicted.mean():.2f}", flush=True)

@@ -214,11 +214,11 @@ def list_(tasks: Annotated[bool, typer.Option("--tasks", help="Instead, list the
 def _list_tasks() -> None:
     from rich.table import Table
 
-    from astra_data.robots.registry import TASKS, known_tasks
+    from astra_data.robots.registry import TASKS, known_names, task_named
 
     table = Table("task", "commands", "abstract states", "target", "steps/s")
     table.columns[0].no_wrap = True
-    for name, known in known_tasks().items():
+    for name, known in zip(known_names(), map(task_named, known_names()), strict=True):
         states = known.abstract_state.names or (f"{known.abstract_state.size} values",)
         shown = name if name in TASKS else f"{name} (installed)"
         values = first_few(list(known.limits), 4), first_few(states, 4)

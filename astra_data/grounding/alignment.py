@@ -35,12 +35,11 @@ class TargetEncoder(nn.Module):
         sensing: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__()
+        alike = {"embedding_size": embedding_size, "latent_size": latent_size}
         self.sizes: dict[str, Any] = {"state_size": state_size, "goal_size": goal_size, "action_size": action_size}
-        self.sizes |= {"embedding_size": embedding_size, "latent_size": latent_size}
-        self.sizes |= {"position_octaves": position_octaves, "encoder": encoder}
+        self.sizes |= {**alike, "position_octaves": position_octaves, "encoder": encoder}
         self.position_features = PositionFeatures(position_octaves)
         input_size = state_size + self.position_features.size + goal_size + action_size
-        alike = {"embedding_size": embedding_size, "latent_size": latent_size}
         self.encoder = ENCODERS[encoder](input_size, **alike)
         self.inputs: dict[str, int] = sensing["inputs"] if sensing else {}
         if sensing:

@@ -71,8 +71,8 @@ class Forecast:
     sizes: tuple[int, ...]
     left: Floats
     more: int  # half as many recordings again
-    expected: tuple[float, float, float]  # what is left with that many: value, low, high
-    gain: tuple[float, float, float]  # by which share of what is left now it is less then: value, low, high
+    expected: Sequence[float]  # what is left with that many: value, low, high
+    gain: Sequence[float]  # by which share of what is left now it is less then: value, low, high
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class Diagnosis:
     steps: int
     responses: tuple[Response, ...]
     missed: tuple[Missed, ...]
-    commands: dict[str, tuple[float, float, float, float]]  # given, its 1 and 99 %; bounds, low and high
+    commands: dict[str, tuple[float, ...]]  # given, its 1 and 99 %; bounds, low and high, by default as recorded
     explained: dict[str, Floats]  # what predicts the error → held-out R² (1 + refits), of all, of resampled recordings
     forecast: Forecast | None  # None of fewer than `FEWEST` recordings
     findings: tuple[Finding, ...]
@@ -96,8 +96,10 @@ def diagnose(dataset: str | Path, simulator: str, progress: Progress = silent) -
     log = _Log.of(source)
     labels = {column.name: column.labels for column in source.schema}
     names = labels[keys.ACTION]
-    usual = [(-1.0, 1.0)] * len(names) if pairing.columns else []  # of a task, ±1
-    commands = _commands(log, names, [*pairing.commands.values()] if pairing.commands else usual)
+    given = np.quantile(log.action, [0.01, 0.99, 0.0, 1.0], axis=0).T
+    if pairing.columns:  # of a task, whose commands have bounds
+        given[:, 2:] = [*pairing.commands.values()] if pairing.commands else (-1.0, 1.0)
+    commands = dict(zip(names, map(tuple, given.tolist()), strict=True))
     felt = _Felt.of(log, pairing, source.info["fps"], progress)
     responses = _responses(log, felt, names, source.info["fps"])
     missed = _missed(log, pairing)
@@ -162,8 +164,6 @@ class _Felt:
     rows: Ints
     alone: Floats
     changes: Floats  # (N, A, K + 1, X): where a command of K steps before takes it, by axis, less `alone`
-    scale: Floats  # of the robot's motion, (X,); of values that do not move, 1
-    used: Bools  # the values that move
 
     @classmethod
     def of(cls, log: _Log, pairing: Pairing, fps: float, progress: Progress = silent) -> "_Felt":
@@ -177,23 +177,23 @@ class _Felt:
             rows = np.sort(np.random.default_rng(0).choice(rows, count, replace=False))
         middle, simulators = log.action.mean(axis=0), built(pairing, len(rows))
         alone = _moved(simulators, log.state[rows], np.broadcast_to(middle, (len(rows), size)))
-        scale = (log.next_state[rows] - alone).std(axis=0)
-        used = scale > 1e-9 * max(1.0, float(np.abs(log.state).max()))
-        scale = np.where(used, scale, 1.0)
-        changes = np.empty((len(rows), size, lags + 1, len(scale)))
+        changes = np.empty((len(rows), size, lags + 1, alone.shape[1]))
         for lag in range(lags + 1):
             progress(lag / (lags + 1), f"{len(rows) * (1 + lag * size):,} steps of the simulator")
             for axis in range(size):
                 one = np.tile(middle, (len(rows), 1))
                 one[:, axis] = log.action[rows - lag, axis]
                 changes[:, axis, lag] = _moved(simulators, log.state[rows], one) - alone
-        return cls(rows, alone, changes, scale, used)
+        return cls(rows, alone, changes)
 
 
 def _responses(log: _Log, felt: _Felt, names: Sequence[str], fps: float) -> tuple[Response, ...]:
     _, size, lags, _ = felt.changes.shape
-    features = (felt.changes / felt.scale)[..., felt.used].reshape(len(felt.rows), size * lags, -1)
-    moved = ((log.next_state[felt.rows] - felt.alone) / felt.scale)[:, felt.used]
+    moved = log.next_state[felt.rows] - felt.alone
+    scale = moved.std(axis=0)
+    used = scale > 1e-9 * max(1.0, float(np.abs(log.state).max()))  # the values that move
+    features = (felt.changes[..., used] / scale[used]).reshape(len(felt.rows), size * lags, -1)
+    moved = moved[:, used] / scale[used]
     weights = _refitted(features, moved, log.recording[felt.rows], size).reshape(-1, size, lags)
     found = []
     for axis, name in enumerate(names):
@@ -377,12 +377,8 @@ def _extrapolated(sizes: tuple[int, ...], left: Floats, more: int) -> Forecast:
     # To what no number of recordings explains; faster than with 1 / recordings, as that of least squares does.
     (before, last), (less, now) = 1 / np.square(sizes[-2:], dtype=float), left[-2:]
     at = np.maximum(0.0, now + (now - less) * (1 / more**2 - last) / (last - before))
-    return Forecast(sizes, left, more, _of_refits(at), _of_refits(1 - at / left[-1]))
-
-
-def _of_refits(values: Floats) -> tuple[float, float, float]:
-    low, middle, high = (float(value) for value in np.percentile(values, [2.5, 50, 97.5]))
-    return middle, low, high
+    expected, gain = np.percentile([at, 1 - at / left[-1]], [50, 2.5, 97.5], axis=1).T.tolist()
+    return Forecast(sizes, left, more, expected, gain)
 
 
 def _of_forecast(forecast: Forecast | None, missed: Sequence[Missed]) -> Iterator[Finding]:
@@ -454,17 +450,7 @@ def _of_hidden_state(explained: Sequence[Floats], shown: Sequence[str]) -> Itera
         yield Finding("note", f"the robot's whole recorded state explains {recorded[0]:.2f} of it", advice)
 
 
-def _commands(
-    log: _Log, names: Sequence[str], bounds: Sequence[tuple[float, float]]
-) -> dict[str, tuple[float, float, float, float]]:
-    """Return the 1 and 99 % quantiles of each command, and its bounds, by default the recorded ones."""
-    given = np.quantile(log.action, [0.01, 0.99, 0.0, 1.0], axis=0).T
-    if bounds:
-        given[:, 2:] = bounds
-    return {name: tuple(row) for name, row in zip(names, given.tolist(), strict=True)}
-
-
-def _of_commands(log: _Log, commands: Mapping[str, tuple[float, float, float, float]]) -> Iterator[Finding]:
+def _of_commands(log: _Log, commands: Mapping[str, tuple[float, ...]]) -> Iterator[Finding]:
     for name, (least, largest, low, high) in commands.items():
         if min(largest, high) - max(least, low) < 0.5 * (high - low):
             yield Finding(

@@ -17,12 +17,17 @@ _LONGEST_M = 16.0  # longest wavelength of position features
 _LEAST = 1e-3  # lower bound of a deviation
 
 
-def mlp(sizes: tuple[int, ...], activation: type[nn.ELU | nn.ReLU] = nn.ELU, *, inplace: bool = False) -> nn.Sequential:
-    """Build linear layers of `sizes` with `activation` between; `inplace` saves time for batches (N, size) only."""
-    layers: list[nn.Module] = []
-    for size_in, size_out in pairwise(sizes):
-        layers += [nn.Linear(size_in, size_out), activation(inplace=inplace)]
-    return nn.Sequential(*layers[:-1])
+def mlp(
+    sizes: tuple[int, ...], activation: type[nn.ELU | nn.ReLU] = nn.ELU, *, inplace: bool = False, norm: bool = False
+) -> nn.Sequential:
+    """Build linear layers of `sizes` with `activation`, after a `norm` of layers, between.
+
+    `inplace` saves time for batches (N, size) only.
+    """
+    layers: list[nn.Module] = [nn.Linear(sizes[0], sizes[1])]
+    for size_in, size_out in pairwise(sizes[1:]):
+        layers += [*[nn.LayerNorm(size_in)] * norm, activation(inplace=inplace), nn.Linear(size_in, size_out)]
+    return nn.Sequential(*layers)
 
 
 class Members(nn.Module):
@@ -90,10 +95,6 @@ class Encoder(nn.Module, ABC):
     @abstractmethod
     def sequence(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
         """Return the latents (B, T, Z) and memories (B, T, M) of `step` for `inputs` (B, T, I)."""
-
-    def forward(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
-        """Return what `sequence` does, as of any network."""
-        return self.sequence(inputs)
 
 
 @torch.no_grad()

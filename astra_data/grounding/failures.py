@@ -214,7 +214,7 @@ def fit_failures(
         take_scales(untrained, {"input": training.steps(inputs)})
         candidates.append((_cross_fitted(untrained, episodes, inputs, divided), untrained, inputs))
     found, untrained, inputs = max(candidates, key=lambda one: one[0][0] if one[0] else -math.inf)
-    model = _descended(untrained, *_steps(episodes, inputs))
+    model = _descended(untrained, episodes, inputs)
     if found:
         _, scale, shift = found
         with torch.no_grad():
@@ -236,7 +236,7 @@ def _cross_fitted(
     for fold in divided:
         others = episodes.select((~fold).nonzero().squeeze(1))
         if _has_both(others.steps(others.windows.fails_soon)):
-            fitted = _descended(untrained, *_steps(others, inputs[~fold]))
+            fitted = _descended(untrained, others, inputs[~fold])
             mask = windows.mask[fold].bool()
             predicted.append((fitted.log_odds(inputs[fold][mask]).detach(), fold, mask))
     if not predicted:
@@ -253,10 +253,6 @@ def _cross_fitted(
     constant = now.sum() * rate.log() + (len(now) - now.sum()) * (1 - rate).log()
     likelihood = (now * hazard.log() + (1 - now) * (1 - hazard).log()).sum()
     return float((likelihood - constant) / now.sum()), scale, shift
-
-
-def _steps(episodes: PairedEpisodes, inputs: Tensor) -> tuple[Tensor, Tensor]:
-    return episodes.steps(inputs), episodes.steps(episodes.windows.fails_soon)
 
 
 def _has_both(fails: Tensor) -> bool:
@@ -281,22 +277,18 @@ def _untrained(task: Task, grounding: Grounding, training: PairedEpisodes, *, se
     return model
 
 
-def _descended(untrained: FailureModel, inputs: Tensor, fails: Tensor) -> FailureModel:
-    """Return a copy of `untrained`, fitted to inputs (N, I) of steps and whether they fail soon (N,)."""
-    model = copy.deepcopy(untrained)
-    failing, going_on = fails.nonzero().squeeze(1), (fails == 0).nonzero().squeeze(1)
+def _descended(untrained: FailureModel, episodes: PairedEpisodes, inputs: Tensor) -> FailureModel:
+    """Return a copy of `untrained`, fitted to inputs (E, T, I) of the steps of episodes and whether they fail soon."""
+    inputs, fails = map(episodes.steps, (inputs, episodes.windows.fails_soon))
+    model, few = copy.deepcopy(untrained), round(_BATCH * _FAILING_SHARE)
+    parts = [(fails.nonzero().squeeze(1), few), ((fails == 0).nonzero().squeeze(1), _BATCH - few)]
     descent = Descent(model, _DESCENT, weight_decay=_WEIGHT_DECAY)
-    few = round(_BATCH * _FAILING_SHARE)
     while not descent.is_over:
-        rows = torch.cat([_drawn(failing, few), _drawn(going_on, _BATCH - few)])
+        rows = torch.cat([of[torch.randint(len(of), (count,), device=of.device)] for of, count in parts])
         odds = model.log_odds(inputs[rows])
         descent.update(functional.binary_cross_entropy_with_logits(odds, fails[rows].expand_as(odds)))
     model.log_odds_shift.copy_(fails.mean().logit() - torch.tensor(_FAILING_SHARE).logit())
     return model.eval()
-
-
-def _drawn(rows: Tensor, count: int) -> Tensor:
-    return rows[torch.randint(len(rows), (count,), device=rows.device)]
 
 
 @torch.no_grad()

@@ -7,15 +7,15 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor, nn
 
-from astra_data.core.checkpoint import as_part, loaded, part_of
+from astra_data.core.checkpoint import as_part, loaded, of_json, part_of
 from astra_data.core.seeding import derive
 from astra_data.grounding.descent import Descent, DescentConfig
 from astra_data.grounding.encoder import mlp
 from astra_data.grounding.failures import FailureModel, FailureShape
 from astra_data.grounding.model import GroundingModel, GroundingShape
 from astra_data.grounding.paired_episodes import PairedEpisodes, PairedWindows
-from astra_data.grounding.simulator import EpisodeSimulator, FittedGrounding
-from astra_data.worlds.protocols import PlacedSimulator, keep_clear
+from astra_data.grounding.simulator import EpisodeSimulator, FittedGrounding, PlacedSimulator
+from astra_data.worlds.protocols import innermost
 
 _MOST = 2.0  # of the logarithm of a scale: off the data no moment shall scatter by more than e² times the usual
 _DESCENT = DescentConfig(updates=500, learning_rate=2e-3)
@@ -134,8 +134,9 @@ class GroundedSimulator(EpisodeSimulator):
         super().__init__(simulator)
         # States are `blocked` where their correction touches a wall, not their scatter.
         self._touches: Tensor | None = simulator.blocked if grounding.fails_at_walls else None
-        if grounding.clearance_m is not None:
-            keep_clear(simulator, grounding.clearance_m)
+        keep_clear = getattr(innermost(simulator), "keep_clear", None)
+        if keep_clear and grounding.clearance_m is not None:
+            keep_clear(grounding.clearance_m)
         self.model, self.failures, self.scatter_model = grounding.model, grounding.failures, grounding.scatter_model
         shape, (count, _), device = self.model.shape, simulator.state.shape, simulator.state.device
         self.latent_size = shape.latent_size
@@ -144,7 +145,6 @@ class GroundedSimulator(EpisodeSimulator):
         self._last = self.latent, torch.zeros(count, shape.action_size, device=device)
         memory_size = self.failures.memory_size if self.failures else 0
         self._remembered = torch.zeros(count, memory_size, device=device)
-        self._hazard: Tensor | None = None
 
     @property
     def blocked(self) -> Tensor:
@@ -189,7 +189,7 @@ class GroundedSimulator(EpisodeSimulator):
         landed = self.landed = self.simulator.step(action)
         if self.failures is not None:
             seen, self._remembered = self.failures.inputs(before, action, landed, latent, self._remembered)
-            self._hazard = self.failures.hazard(self.failures.probability(seen))
+            self.hazard = self.failures.hazard(self.failures.probability(seen))
         inputs = self.model.correction_inputs(latent, action, landed)
         state = corrected = self.model.corrected(inputs, landed)
         if self._touches is not None or self.scatter_model is None:
@@ -204,15 +204,11 @@ class GroundedSimulator(EpisodeSimulator):
         """Return the encoder's memory (n, M) after one more step."""
         return self.model.encoder.step(self.model.encoder_input(state, goal, previous_action), hidden)
 
-    def failure_risk(self) -> Tensor | None:
-        """Return the probability (B,) that the target failed in the last step; None if unknown."""
-        return self._hazard
-
     @torch.no_grad()
     def predicted_reward(self, own: Tensor) -> Tensor:
         """Return the target's reward (B,) of the last step, by R_pred; see `EpisodeSimulator`."""
         latent, action = self._last
-        return self.model.target_reward(latent, action, own, self._hazard)
+        return self.model.target_reward(latent, action, own, self.hazard)
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return all that `load_state_dict` needs to continue from here."""
@@ -279,15 +275,10 @@ class HistoryGrounding(FittedGrounding):
         parts = {_FAILURES: (FailureModel, FailureShape), _SCATTER: (ScatterModel, ScatterShape)}
         own = {name: one for name, one in tensors.items() if not name.startswith(tuple(f"{part}." for part in parts))}
         read: dict[str, Any] = {
-            part: loaded(made(shape(**_tuples(metadata[part]))), part_of(tensors, part), device)
+            part: loaded(made(of_json(shape, metadata[part])), part_of(tensors, part), device)
             for part, (made, shape) in parts.items()
             if part in metadata
         }
-        model = loaded(GroundingModel(GroundingShape(**_tuples(metadata["shape"]))), own, device)
+        model = loaded(GroundingModel(of_json(GroundingShape, metadata["shape"])), own, device)
         clearance_m, fails_at_walls = metadata.get("clearance_m"), metadata["fails_at_walls"]
         return cls(model, read.get(_FAILURES), clearance_m, read.get(_SCATTER), fails_at_walls)
-
-
-def _tuples(shape: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the sizes of a shape as they were before JSON made lists of tuples."""
-    return {key: tuple(value) if isinstance(value, list) else value for key, value in shape.items()}

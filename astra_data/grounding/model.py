@@ -213,19 +213,15 @@ class GroundingModel(nn.Module):
         seen = self.correction_inputs(latent, action, windows.simulated_next)
         corrected = self.corrected(seen, windows.simulated_next)
         if self.touched is not None:
-            parts["touched"] = _masked_mean(self._touched_bce(seen, windows), mask)
+            correction = (windows.next_state - windows.simulated_next) / self.correction_std
+            moved = (correction[..., self.shape.lying_ball].norm(dim=-1) > _TOUCHED).float()  # not as simulated
+            logits = self.touched(seen).squeeze(-1)
+            bce = functional.binary_cross_entropy_with_logits(logits, moved, reduction="none")
+            parts["touched"] = _masked_mean(bce, mask)
             total = total + parts["touched"]
         error = ((corrected - windows.next_state) / self.correction_std)[..., : self.corrected_size].square().mean(-1)
         parts["state"] = _masked_mean(error, mask)
         return total + parts["state"], parts
-
-    def _touched_bce(self, inputs: Tensor, windows: PairedWindows) -> Tensor:
-        """Return the binary cross-entropy (B, T) of whether a lying ball moved other than in the simulator."""
-        assert self.touched is not None
-        correction = (windows.next_state - windows.simulated_next) / self.correction_std
-        moved = (correction[..., self.shape.lying_ball].norm(dim=-1) > _TOUCHED).float()
-        logits = self.touched(inputs).squeeze(-1)
-        return functional.binary_cross_entropy_with_logits(logits, moved, reduction="none")
 
     @torch.no_grad()
     def _following_latent(self, inputs: Tensor) -> Tensor:

@@ -105,7 +105,8 @@ class PairedEpisodes:
             raise BadInputError(f"{root} has no column {names.ABSTRACT_STATE}: expected a dataset that was paired")
         known = {names.GOAL, names.REWARD, names.SUCCESS} & dataset.features.keys()
         columns = dataset.columns(list(dict.fromkeys([*_COLUMNS, *known, *inputs])))
-        uids, lengths, recordings, held_out = dataset.uids, dataset.lengths, dataset.recordings, dataset.held_out
+        lengths: NDArray[np.int64] = dataset.lengths
+        which: NDArray[np.intp] = np.arange(len(dataset))  # the episode that each piece is of
         if (made_up := _made_up(dataset, columns)).any():
             columns, lengths = _merged(columns, lengths, made_up)
             left = lengths > 0
@@ -113,10 +114,10 @@ class PairedEpisodes:
                 raise BadInputError(
                     f"{root}: no step is left: each episode has a single one, whose next state was made up"
                 )
-            uids, lengths, recordings, held_out = uids[left], lengths[left], recordings[left], held_out[left]
+            lengths, which = lengths[left], which[left]
         if not whole:
             lengths, cut = _pieces(lengths)
-            uids, recordings, held_out = uids[cut], recordings[cut], held_out[cut]
+            which = which[cut]
         bounds = dataset.description["simulator"].get("commands")
         commands = Commands({name: tuple(ends) for name, ends in bounds.items()}) if bounds else None
         padded = {}
@@ -152,9 +153,9 @@ class PairedEpisodes:
             reference=dataset.reference,
             content_hash=dataset.content_hash,
             has_rewards=names.REWARD in padded,
-            uids=torch.tensor(uids, device=device),
-            recordings=torch.tensor(recordings, device=device),
-            held_out=torch.tensor(held_out, device=device) if held_out.any() else None,
+            uids=torch.tensor(dataset.uids[which], device=device),
+            recordings=torch.tensor(dataset.recordings[which], device=device),
+            held_out=torch.tensor(held_out, device=device) if (held_out := dataset.held_out[which]).any() else None,
             dropped_place=() if inputs else _dropped_place(dataset),
             commands=commands,
         )

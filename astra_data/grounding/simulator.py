@@ -6,12 +6,15 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self
 
 from astra_data.core.lazy import Tensor
 from astra_data.grounding.paired_episodes import PairedWindows
-from astra_data.worlds.protocols import PlacedSimulator, RememberingSimulator
+from astra_data.worlds.protocols import RememberingSimulator, TaskSimulator, innermost
 from astra_data.worlds.task import Task
 from astra_data.worlds.variation import Variation, VariedSimulator
 
 if TYPE_CHECKING:
     from astra_data.grounding.encoder import Encoder
+
+
+PlacedSimulator = TaskSimulator | VariedSimulator  # whose states a correction may move after each step
 
 
 class LatentEncoder(Protocol):
@@ -28,13 +31,12 @@ class EpisodeSimulator:
 
     latent_size: int = 0  # Z, of the latents that policies observe; 0 where there are none
     landed: Tensor  # where the simulator landed in the last step, before any correction, (B, X)
+    hazard: Tensor | None = None  # the probability (B,) that the target failed in the last step; None where unknown
 
     def __init__(self, simulator: PlacedSimulator) -> None:
         self.simulator, self.landed = simulator, simulator.state
         self._varied = simulator if isinstance(simulator, VariedSimulator) else None
-        inner: object = simulator
-        while hasattr(inner, "simulator"):
-            inner = inner.simulator
+        inner = innermost(simulator)
         self._remembering = inner if isinstance(inner, RememberingSimulator) else None
 
     @property
@@ -82,10 +84,6 @@ class EpisodeSimulator:
     def _settle(self, before: Tensor, corrected: Tensor) -> Tensor:
         """Move from `before` to `corrected` (B, X), as far as walls allow; return where that is."""
         return self.simulator.settle(before, corrected)
-
-    def failure_risk(self) -> Tensor | None:
-        """Return the probability (B,) that the target failed in the last step; None where unknown."""
-        return None
 
     def predicted_reward(self, own: Tensor) -> Tensor | None:
         """Return the target's reward (B,) as predicted, given the task's `own`; None where nothing does."""

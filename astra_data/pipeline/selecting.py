@@ -196,7 +196,7 @@ def choose_by_trials(
             scale = EvaluateConfig.model_validate(trained.settings.get("evaluate") or {}).leg_scale
             policy = trained.running()
             begin, drawn = partial(started, policy, policy.act), derive(number, "trials of a choice")
-            outcome = in_target(policy.task, begin, each, drawn, leg_scale=scale).outcome
+            outcome = in_target(policy.task, begin, each, drawn, leg_scale=scale)
             success = [int(one) for one in outcome.success]
             tried = [*rounds[number].tried, choice.Tried(row=row, seed=seed, success=success)]
             rounds[number] = rounds[number].model_copy(update={"tried": tried})

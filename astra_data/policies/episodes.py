@@ -34,6 +34,12 @@ class Outcome:
     steps: list[int]  # until the end
     returns: list[float]  # sum of rewards
     position: Tensor  # of what moves, (N, T + 1, 2 K) in m, from the start on, NaN after the end
+    goal: Tensor  # (N, G)
+
+    @property
+    def start_goal(self) -> dict[str, Tensor]:
+        """Where they began, "start" (N, 2 K), and "goal"."""
+        return {"start": self.position[:, 0], "goal": self.goal}
 
     def to_json(self) -> dict[str, list[float]]:
         """Return the lists by name."""
@@ -44,12 +50,12 @@ class Outcome:
 class EpisodeRecord:
     """Record N episodes until each has ended: `active`, (N,) bool, have not; `total_steps` are those of all so far."""
 
-    def __init__(self, position: Tensor) -> None:
-        """Start at `position` (N, 2 K)."""
+    def __init__(self, position: Tensor, goal: Tensor) -> None:
+        """Start at `position` (N, 2 K), with goals (N, G)."""
         count = len(position)
         self.active, self.total_steps = torch.ones(count, dtype=torch.bool), 0
         self._success, self._failed, self._contact, self._steps, self._return = torch.zeros(5, count)
-        self._positions = [position.clone()]
+        self._positions, self._goal = [position.clone()], goal.clone()
 
     def add(self, position: Tensor, reward: Tensor, success: Tensor, failed: Tensor, contact: Tensor) -> None:
         """Add one step; rows of ended episodes are ignored."""
@@ -72,6 +78,7 @@ class EpisodeRecord:
             steps=self._steps.long().tolist(),
             returns=self._return.tolist(),
             position=torch.stack(self._positions, dim=1),
+            goal=self._goal,
         )
 
 
@@ -129,16 +136,15 @@ def in_simulator(
     asked: RecordedRange | None = None,
     *,
     starts: tuple[Tensor, Tensor] | None = None,
-) -> tuple[Outcome, dict[str, Tensor]]:
-    """Run an episode in each row of `world`, from `starts` (B, X) with goals (B, G) or the seed's; return both, too."""
+) -> Outcome:
+    """Run an episode in each row of `world`, from `starts` (B, X) with goals (B, G), by default the seed's."""
     torch.manual_seed(seed)
     if starts is None:
         world.reset()
     else:
-        world.start_from(*starts)
+        world.start_from(*starts, torch.arange(world.num_envs, device=world.device))
     act = begin(world.goal)
-    record = EpisodeRecord(world.objective.places(world.simulator.state))
-    start_goal = {"start": world.objective.places(world.simulator.state).clone(), "goal": world.goal.clone()}
+    record = EpisodeRecord(world.objective.places(world.simulator.state), world.goal)
     for number in range(horizon):
         action = act(world.simulator.state, world.goal)
         if asked is not None:
@@ -149,7 +155,7 @@ def in_simulator(
         record.add(places, step.reward, success, world.failed, world.simulator.blocked)
         if not record.active.any():
             break
-    return record.outcome(), start_goal
+    return record.outcome()
 
 
 class ObservedTargetEnv:
@@ -210,13 +216,6 @@ class ObservedTargetEnv:
         return self._observe()
 
 
-class TargetEpisodes(NamedTuple):
-    """Episodes in the target."""
-
-    outcome: Outcome
-    start_goal: dict[str, Tensor]  # where they began, "start" (B, 2) or with balls (B, 4), and "goal" (B, G)
-
-
 def in_target(
     task: Task,
     begin: Begin,
@@ -227,7 +226,7 @@ def in_target(
     num_threads: int | None = None,
     progress: Progress = silent,
     asked: RecordedRange | None = None,
-) -> TargetEpisodes:
+) -> Outcome:
     """Run so many episodes side by side, with any `num_threads`; `leg_scale` is a factor on the ant's legs."""
     if leg_scale != 1.0 and "leg_scale" not in task.facts:
         raise BadInputError(
@@ -236,9 +235,8 @@ def in_target(
     legs = {} if leg_scale == 1.0 else {"leg_scale": leg_scale}
     env = task.target(episodes, seed=seed, num_threads=num_threads, **legs)
     env.reset()
-    start_goal = {"start": env.position.clone(), "goal": env.goal.clone()}
     act = begin(env.goal)
-    record = EpisodeRecord(env.position)
+    record = EpisodeRecord(env.position, env.goal)
     began = time.perf_counter()
     for step in range(task.objective.horizon):
         action = act(env.state, env.goal)
@@ -251,7 +249,7 @@ def in_target(
         progress((step + 1) / task.objective.horizon * 0.99, f"{rate:,.0f} target steps/s")
         if not record.active.any():
             break
-    return TargetEpisodes(record.outcome(), start_goal)
+    return record.outcome()
 
 
 def judged_success(task: Task, judge: Grounding, policy: RunningPolicy, episodes: int, seed: int) -> float:
@@ -278,7 +276,7 @@ def _judged(
 ) -> list[float]:
     world = SimulatorEnv(task.objective, judge.simulator(task, episodes), draws_failures=True)
     begin = partial(started, policy, policy.act_in_simulator)
-    return in_simulator(world, begin, task.objective.horizon, seed, starts=starts)[0].success
+    return in_simulator(world, begin, task.objective.horizon, seed, starts=starts).success
 
 
 _EPISODES = 100
@@ -301,6 +299,6 @@ def reached_in_own_world(task: Task, trained: PolicyFile, grounding: Grounding, 
     policy, horizon = running(task, trained, grounding), task.objective.horizon
     world = training_env(task, trained.simulation, grounding, num_envs=_EPISODES)
     begin = partial(started, policy, policy.act_in_simulator)
-    outcome, _ = in_simulator(world, begin, horizon, derive(seed, "trial in its own simulator"))
+    outcome = in_simulator(world, begin, horizon, derive(seed, "trial in its own simulator"))
     steps = [steps for steps, success in zip(outcome.steps, outcome.success, strict=True) if success]
     return Reached(fmean(outcome.success), fmean(steps) if steps else float(horizon))

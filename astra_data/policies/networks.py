@@ -4,7 +4,6 @@ import copy
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 import torch
@@ -18,6 +17,7 @@ from astra_data.policies.learner import PACKAGE_KINDS, ActingPolicy
 from astra_data.worlds.user_code import explained
 
 _INITIAL_LOG_STD = -0.5  # of the actions of an actor
+_LARGEST_REWARD = 10.0  # scaled rewards are clipped to this
 
 
 @dataclass(frozen=True)
@@ -36,36 +36,33 @@ class PolicyShape:
         """F, size of the input of the heads: the observation and the memory."""
         return self.observation_size + self.memory_size
 
-    def new_memory(self) -> HistoryEncoder | None:
-        """Build an untrained memory; None where there is none."""
-        if not self.memory_size:
-            return None
-        return HistoryEncoder(
-            self.observation_size + self.action_size, embedding_size=self.embedding_size, latent_size=self.memory_size
-        )
 
-
-def features_of(
-    memory: HistoryEncoder | None, observation: Tensor, previous_action: Tensor, hidden: Tensor, start: Tensor
-) -> Tensor:
-    """Return the features (B, T, F) of (B, T, ...), from `hidden` (B, M), which is zero where `start` (B, T) is 1."""
-    if memory is None:
-        return observation
-    inputs = torch.cat([observation, previous_action], dim=-1)
-    return torch.cat([observation, memory.latent(memory.through_episodes(inputs, hidden, start))], dim=-1)
-
-
-class Policy(nn.Module, ABC):
-    """Acts on observations and its memory of them, an argument and a result, `hidden` (B, M), never kept."""
+class Remembering(nn.Module):
+    """A memory of observations, if there is one: an argument and a result, `hidden` (B, M), never kept."""
 
     def __init__(self, shape: PolicyShape) -> None:
         super().__init__()
         self.shape = shape
-        self.memory = shape.new_memory()
+        self.memory: HistoryEncoder | None = None
+        if shape.memory_size:
+            sizes = {"embedding_size": shape.embedding_size, "latent_size": shape.memory_size}
+            self.memory = HistoryEncoder(shape.observation_size + shape.action_size, **sizes)
 
     def initial_hidden(self, count: int) -> Tensor:
         """Return the memory (count, M) at the start of an episode."""
         return torch.zeros(count, self.shape.memory_size, device=next(self.parameters(), torch.empty(0)).device)
+
+    def remember_sequence(self, observation: Tensor, previous_action: Tensor, hidden: Tensor, start: Tensor) -> Tensor:
+        """Return the features (B, T, F) of T steps, from `hidden` (B, M), which is zero where `start` (B, T) is 1."""
+        if self.memory is None:
+            return observation
+        inputs = torch.cat([observation, previous_action], dim=-1)
+        states = self.memory.through_episodes(inputs, hidden, start)
+        return torch.cat([observation, self.memory.latent(states)], dim=-1)
+
+
+class Policy(Remembering, ABC):
+    """Acts on observations and its memory of them."""
 
     def remember(self, observation: Tensor, previous_action: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
         """Process one step; return the features (B, F), and the next hidden (B, M)."""
@@ -73,10 +70,6 @@ class Policy(nn.Module, ABC):
             return observation, hidden
         hidden = self.memory.step(torch.cat([observation, previous_action], dim=-1), hidden)
         return torch.cat([observation, self.memory.latent(hidden)], dim=-1), hidden
-
-    def remember_sequence(self, observation: Tensor, previous_action: Tensor, hidden: Tensor, start: Tensor) -> Tensor:
-        """Return the features (B, T, F) of T steps; see `features_of`."""
-        return features_of(self.memory, observation, previous_action, hidden, start)
 
     @abstractmethod
     def policy(self, features: Tensor) -> tuple[Tensor, Tensor]:
@@ -278,18 +271,13 @@ class Critics(nn.Module):
         return torch.as_tensor((torch.minimum(first, second) - self.value(observation)).squeeze(-1))
 
 
-class RecurrentCritics(nn.Module):
+class RecurrentCritics(Remembering):
     """Two action values, and the memory that both share; layer normalization keeps them from diverging."""
 
     def __init__(self, shape: PolicyShape) -> None:
-        super().__init__()
-        self.memory = shape.new_memory()
-        self.networks = nn.ModuleList(_action_value(shape) for _ in range(2))
-
-    def features(self, observation: Tensor, previous_action: Tensor, first: Tensor) -> Tensor:
-        """Return the features (B, T, F) of windows of (B, T, ...), before which nothing is remembered."""
-        nothing = observation.new_zeros(len(observation), 0 if self.memory is None else self.memory.latent_size)
-        return features_of(self.memory, observation, previous_action, nothing, first)
+        super().__init__(shape)
+        sizes = (shape.feature_size + shape.action_size, *shape.hidden_sizes, 1)
+        self.networks = nn.ModuleList(mlp(sizes, nn.ReLU, inplace=True, norm=True) for _ in range(2))
 
     def forward(self, features: Tensor, action: Tensor) -> Tensor:
         """Return both values (2, ...) of features (..., F) and actions (..., A)."""
@@ -297,12 +285,29 @@ class RecurrentCritics(nn.Module):
         return torch.stack([network(pair).squeeze(-1) for network in self.networks])
 
 
-def _action_value(shape: PolicyShape) -> nn.Sequential:
-    layers: list[nn.Module] = []
-    sizes = shape.feature_size + shape.action_size, *shape.hidden_sizes
-    for size_in, size_out in pairwise(sizes):
-        layers += [nn.Linear(size_in, size_out), nn.LayerNorm(size_out), nn.ReLU(inplace=True)]
-    return nn.Sequential(*layers, nn.Linear(sizes[-1], 1))
+class ReturnScale(nn.Module):
+    """The running deviation of discounted sums of B rows' rewards, as in VecNormalize of OpenAI Baselines."""
+
+    def __init__(self, num_envs: int, discount: float) -> None:
+        super().__init__()
+        self.discount = discount
+        self.sums: Tensor = nn.Buffer(torch.zeros(num_envs))
+        count, mean, var = torch.tensor([1e-4, 0.0, 1.0], dtype=torch.float64)
+        self.count: Tensor = nn.Buffer(count)
+        self.mean: Tensor = nn.Buffer(mean)
+        self.var: Tensor = nn.Buffer(var)
+
+    def scaled(self, reward: Tensor, done: Tensor) -> Tensor:
+        """Take in the rewards (B,) of a step, after which rows may be `done` (B,), and return them scaled."""
+        self.sums = self.sums * self.discount + reward
+        sums, count = self.sums.double(), len(reward)
+        apart, total = sums.mean() - self.mean, self.count + count
+        spread = self.var * self.count + sums.var(correction=0) * count
+        self.var = (spread + apart.square() * self.count * count / total) / total
+        self.mean, self.count = self.mean + apart * count / total, total
+        self.sums = torch.where(done, 0.0, self.sums)
+        deviation = (self.var + 1e-8).sqrt().float()
+        return torch.clamp(reward / deviation, -_LARGEST_REWARD, _LARGEST_REWARD)
 
 
 class UserPolicy(Policy):

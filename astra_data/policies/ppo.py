@@ -52,12 +52,14 @@ class Ppo(Learner):
     def __init__(self, env: BatchedEnv, policy: "ActorCritic", config: PpoConfig, *, horizon: int, seed: int) -> None:
         if env.num_envs * config.rollout_steps == 1:
             raise BadInputError("rollout_steps: expected 2 or more in a single environment, got 1")
+        from astra_data.policies.networks import ReturnScale
+
         self.policy, self.config = policy, config
         with torch.no_grad():
             list(policy.critic.parameters())[-2].mul_(_CRITIC_GAIN)
         self._first_std = float(policy.log_std.detach().exp().max())
         self._optimizer = torch.optim.Adam(policy.parameters(), lr=config.learning_rate, eps=1e-5, fused=True)
-        self._returns = ReturnScale(env.num_envs, config.discount, policy.log_std.device)
+        self._returns = ReturnScale(env.num_envs, config.discount).to(policy.log_std.device)
         self._segment_steps = math.gcd(config.rollout_steps, _SEGMENT_STEPS)
         torch.manual_seed(derive(seed, "first reset"))
         super().__init__(
@@ -170,36 +172,3 @@ def generalized_advantages(
     for step in reversed(range(error.shape[1])):
         later = advantage[:, step] = error[:, step] + kept[:, step] * later
     return advantage
-
-
-_LARGEST = 10.0  # scaled rewards are clipped to this
-
-
-class ReturnScale:
-    """The running deviation of discounted sums of B rows' rewards, as in VecNormalize of OpenAI Baselines."""
-
-    def __init__(self, num_envs: int, discount: float, device: "torch.device") -> None:
-        self.discount = discount
-        self.sums = torch.zeros(num_envs, device=device)
-        self.count, self.mean, self.var = torch.tensor([1e-4, 0.0, 1.0], dtype=torch.float64, device=device)
-
-    def scaled(self, reward: Tensor, done: Tensor) -> Tensor:
-        """Take in the rewards (B,) of a step, after which rows may be `done` (B,), and return them scaled."""
-        self.sums = self.sums * self.discount + reward
-        sums, count = self.sums.double(), len(reward)
-        apart, total = sums.mean() - self.mean, self.count + count
-        spread = self.var * self.count + sums.var(correction=0) * count
-        self.var = (spread + apart.square() * self.count * count / total) / total
-        self.mean, self.count = self.mean + apart * count / total, total
-        self.sums = torch.where(done, 0.0, self.sums)
-        deviation = (self.var + 1e-8).sqrt().float()
-        return torch.clamp(reward / deviation, -_LARGEST, _LARGEST)
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """Return all that `load_state_dict` needs."""
-        return {"sums": self.sums, "moments": torch.stack([self.count, self.mean, self.var])}
-
-    def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Continue from `state`."""
-        self.sums = state["sums"].to(self.sums.device)
-        self.count, self.mean, self.var = state["moments"].to(self.sums.device)

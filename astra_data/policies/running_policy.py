@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from astra_data.core.checkpoint import as_part, loaded, part_of, save_tensors, understood
+from astra_data.core.checkpoint import as_part, loaded, of_json, part_of, save_tensors, understood
 from astra_data.core.errors import BadInputError
 from astra_data.core.lazy import Tensor, torch, without_gradients
 from astra_data.grounding.features import encoded
@@ -102,17 +102,16 @@ class RunningPolicy:
         """
         if not hasattr(self, "memory"):
             raise BadInputError("expected start(count) before the first command")
-        read = self._state(state) if self.sensing is None else self._inputs(state, self.sensing)
+        read = self._read(state)
         goal = self._checked("goal", goal, self.task.objective.goal_size)
         return self.task.limits.in_units(self.act(read, goal))
 
-    def _state(self, given: Given | Shown) -> Tensor:
-        if isinstance(given, Mapping):
-            raise BadInputError("expected states, got a dict, which policies take that were aligned with `inputs`")
-        return self._checked("state", given, self.task.state.size)
-
-    def _inputs(self, given: Given | Shown, sensing: "TargetEncoder") -> Tensor:
-        """Return the inputs in the place of states, (B, S), features of pictures among them."""
+    def _read(self, given: Given | Shown) -> Tensor:
+        """Return states (B, S), or the inputs in their place, features of pictures among them."""
+        if (sensing := self.sensing) is None:
+            if isinstance(given, Mapping):
+                raise BadInputError("expected states, got a dict, which policies take that were aligned with `inputs`")
+            return self._checked("state", given, self.task.state.size)
         shown, read = given if isinstance(given, Mapping) else {}, list[Tensor]()
         for name, size in sensing.inputs.items():
             made_by = sensing.pictures.get(name, {})
@@ -223,14 +222,13 @@ class PolicyFile:
         from astra_data.policies.networks import NETWORKS, Policy, UserPolicy
 
         with understood(Path(path), "a policy", (*NETWORKS, *KINDS), device) as (tensors, metadata):
-            weights, simulation = part_of(tensors, _PART), None
-            shape = metadata["shape"] | {"hidden_sizes": tuple(metadata["shape"]["hidden_sizes"])}
+            weights, simulation, shape = part_of(tensors, _PART), None, metadata["shape"]
             if "own" in metadata:
                 acting = restored(KINDS[metadata["kind"]], weights, metadata["own"])
                 policy: Policy = UserPolicy(acting, shape["observation_size"], shape["action_size"])
             else:
                 made, shaped = NETWORKS[metadata["kind"]]
-                policy = loaded(made(shaped(**shape)), weights, device)
+                policy = loaded(made(of_json(shaped, shape)), weights, device)
             if recorded := metadata.get("simulation"):
                 variation = recorded["variation"]
                 simulation = Simulation(WorldConfig(**recorded["world"]), variation and Variation.of_json(variation))

@@ -141,11 +141,12 @@ class Sac(Learner):
         critics, temperature = self._critics, self._log_temperature.detach().exp()
         seen, first = (steps["observation"], steps["previous_action"]), steps["first"].float()
         acting = self.policy.remember_sequence(*seen, steps["hidden"][:, 0], first)
-        judging = critics.features(*seen, first)[:, :-1][learned]
+        anew = *seen, critics.initial_hidden(len(first)), first
+        judging = critics.remember_sequence(*anew)[:, :-1][learned]
         reward, terminated, taken = (steps[name][:, :-1][learned] for name in ("reward", "terminated", "action"))
         with torch.no_grad():
             action, log_prob = self.policy.sample(acting[:, 1:][learned])
-            late = self._late_critics.features(*seen, first)[:, 1:][learned]
+            late = self._late_critics.remember_sequence(*anew)[:, 1:][learned]
             following = self._late_critics(late, action).amin(0) - temperature * log_prob
             wanted = reward + self.config.discount * ~terminated * following
         critic_loss = (critics(judging, taken) - wanted).square().mean(1).sum()

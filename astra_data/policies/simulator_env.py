@@ -5,7 +5,6 @@ from typing import Literal
 
 import numpy as np
 
-from astra_data.core.arrays import Floats
 from astra_data.core.config import Config, NotNegative, Positive, Share
 from astra_data.core.errors import BadInputError
 from astra_data.core.lazy import Tensor, torch, without_gradients
@@ -89,34 +88,25 @@ class SimulatorEnv:
         if len(rows):
             share = 0.0 if self.starts is None else self.world.data_start_share
             from_data = torch.rand(len(rows), device=self.device) < share
-            self._start_task(rows[~from_data])
-            if self.starts is not None:
-                self._start_from_data(rows[from_data], self.starts)
+            anew, recorded = rows[~from_data], rows[from_data]
+            rng = np.random.default_rng(int(torch.randint(2**62, ())))
+            if len(anew):  # a user's objective need not know what none is
+                draws = self.objective.draw_starts(rng, len(anew)), self.objective.draw_goals(rng, len(anew))
+                state, goal = (torch.from_numpy(drawn).float().to(self.device) for drawn in draws)
+                self.start_from(state, goal, anew)
+            if (starts := self.starts) is not None:
+                moments = torch.randint(len(starts.state), (len(recorded),), device=self.device)
+                hidden = None if starts.hidden is None else starts.hidden[moments]
+                state, goal, action = (each[moments] for each in (starts.state, starts.goal, starts.previous_action))
+                self.start_from(state, goal, recorded, hidden, action)
         return self._observe()
 
-    def _start_task(self, rows: Tensor) -> None:
-        rng = np.random.default_rng(int(torch.randint(2**62, ())))
-        if len(rows):  # a user's objective need not know what none is
-            state = self._tensor(self.objective.draw_starts(rng, len(rows)))
-            self._start(state, self._tensor(self.objective.draw_goals(rng, len(rows))), rows)
-
-    def start_from(self, state: Tensor, goal: Tensor) -> None:
-        """Start an episode in each row, from states (B, X) with goals (B, G)."""
-        self._start(state, goal, torch.arange(self.num_envs, device=self.device))
-
-    def _start_from_data(self, rows: Tensor, starts: DataStarts) -> None:
-        moments = torch.randint(len(starts.state), (len(rows),), device=self.device)
-        hidden = None if starts.hidden is None else starts.hidden[moments]
-        self._start(starts.state[moments], starts.goal[moments], rows, hidden, starts.previous_action[moments])
-
-    def _start(
+    def start_from(
         self, state: Tensor, goal: Tensor, rows: Tensor, hidden: Tensor | None = None, action: Tensor | None = None
     ) -> None:
+        """Start episodes in `rows` (n,), from states (n, X) with goals (n, G), after what is given of a history."""
         self.goal[rows], self._command[rows] = goal, 0.0 if action is None else action
         self.simulator.start(state, rows, goal, hidden=hidden, previous_action=action)
-
-    def _tensor(self, values: Floats) -> Tensor:
-        return torch.from_numpy(values).float().to(self.device)
 
     def step(self, action: Tensor) -> Step:
         """Apply `action` (B, A), clipped to ±1 and to the command limit."""
@@ -127,7 +117,7 @@ class SimulatorEnv:
         failed = self.objective.missed(after, self.goal)
         if self.objective.ends_at_walls:
             failed = failed | self.simulator.blocked
-        risk = self.simulator.failure_risk()
+        risk = self.simulator.hazard
         if risk is not None and self.draws_failures:
             failed = failed | (torch.rand_like(risk) < risk)
         self.failed = failed & ~success
@@ -176,6 +166,7 @@ class SimulatorEnv:
         return self._observe()
 
 
+CHANGE_PENALTY = 0.02  # of the plus settings; recorded ants fall where commands change
 _ALONG_AN_AXIS = 1.0
 _LEAST_RATIO = 1.5  # of the rates of failures above and below the limit
 
@@ -198,15 +189,6 @@ def command_limit(task: Task, episodes: PairedEpisodes) -> float:
         return NO_LIMIT
     is_riskier = not len(below) or float(above.mean()) >= _LEAST_RATIO * float(below.mean())
     return _ALONG_AN_AXIS if is_riskier else NO_LIMIT
-
-
-_CHANGE_PENALTY = 0.02  # of the plus settings; recorded ants fall where commands change
-
-
-def plus(world: WorldConfig, command_limit: float) -> WorldConfig:
-    """Return the plus settings of `world`: failures are priced, and changes of the command cost."""
-    changes = {"reward": "priced", "change_penalty": _CHANGE_PENALTY, "command_limit": command_limit}
-    return world.model_copy(update=changes)
 
 
 @dataclass(frozen=True)

@@ -27,13 +27,13 @@ from astra_data.policies.ppo import Ppo, PpoConfig
 from astra_data.policies.running_policy import POLICY, Observed, PolicyFile
 from astra_data.policies.sac import Sac, SacConfig
 from astra_data.policies.simulator_env import (
+    CHANGE_PENALTY,
     RewardSource,
     Simulation,
     SimulatorEnv,
     WorldConfig,
     command_limit,
     data_starts,
-    plus,
     training_env,
 )
 from astra_data.worlds.task import Task
@@ -145,11 +145,11 @@ class InSimulator:
         config = training.config
         task, episodes, grounding = training.task, training.episodes, training.grounding
         world = WorldConfig(reward=self.reward, data_start_share=config.data_start_share)
-        if training.is_plus:
-            world = plus(world, command_limit(task, episodes))
+        if training.is_plus:  # failures are priced, and changes of the command cost
+            changes = {"reward": "priced", "change_penalty": CHANGE_PENALTY}
+            world = world.model_copy(update={**changes, "command_limit": command_limit(task, episodes)})
         variation = getattr(task.varied, self.ranges) if self.ranges else None
-        starts = data_starts(task, world, episodes, grounding)
-        simulation = Simulation(world, variation)
+        starts, simulation = data_starts(task, world, episodes, grounding), Simulation(world, variation)
         make = partial(training_env, task, simulation, grounding, num_envs=config.num_envs, device=training.device)
         return make(starts=starts, shows_parameters=shows_parameters), simulation
 
@@ -249,8 +249,7 @@ def with_restarts(learn: Learn, training: Training, grounding_file: Path | None)
         folder = training.folder / (f"try_{number}" if number else "")
         folder.mkdir(exist_ok=True)
         begins, ends = ((2**count - 1) / (2**config.tries - 1) for count in (number, number + 1))  # of all steps
-        share = part(training.progress, begins, ends)
-        noted = partial(_noted, share, f"try {number + 1} of {config.tries}")
+        noted = part(training.progress, begins, ends, f"try {number + 1} of {config.tries}  ")
         longer = config.model_copy(update={"total_steps": config.total_steps * 2**number})
         policy, curve = learn(replace(training, config=longer, seed=seed, folder=folder, progress=noted))
         policy.save(folder / POLICY)
@@ -267,10 +266,6 @@ def with_restarts(learn: Learn, training: Training, grounding_file: Path | None)
     for folder in training.folder.glob("try_*"):
         shutil.rmtree(folder)
     return policy, curve | spent | {"tries": tries}
-
-
-def _noted(progress: Progress, which: str, share: float, note: str) -> None:
-    progress(share, f"{which}  {note}")
 
 
 @dataclass(frozen=True, kw_only=True)

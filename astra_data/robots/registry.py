@@ -47,11 +47,6 @@ def place_of(name: str) -> str:
     return name if name in TASKS or is_user_code(name) else offered(TASK_GROUP).get(name, name)
 
 
-def known_tasks() -> dict[str, Task]:
-    """Return the tasks of this package and of installed ones, by name."""
-    return {name: task_named(name) for name in known_names()}
-
-
 @dataclass(frozen=True)
 class Pairing:
     """An abstract simulator, and the map φ to its states; what a task tells is None or empty without one."""

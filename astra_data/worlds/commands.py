@@ -11,7 +11,7 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.lazy import Tensor, torch
 from astra_data.dataset.columns import ACTION
 from astra_data.dataset.versions import open_dataset
-from astra_data.worlds.protocols import SteppedSimulator
+from astra_data.worlds.protocols import AbstractSimulator
 from astra_data.worlds.variation import VariedSimulator, noisy_command
 
 
@@ -80,7 +80,7 @@ def _is_range(ends: Iterable[float]) -> bool:
 class DrivenSimulator:
     """B abstract simulators of a task, given actions of ±1 and states on any device; what they lack does nothing."""
 
-    def __init__(self, simulator: SteppedSimulator, commands: Commands, device: str) -> None:
+    def __init__(self, simulator: AbstractSimulator, commands: Commands, device: str) -> None:
         self.simulator = simulator
         self._commands, self._device = commands, device
         self._there = simulator.state.device

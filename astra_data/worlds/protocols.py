@@ -12,8 +12,8 @@ from astra_data.core.lazy import Tensor
 from astra_data.dataset.columns import Column
 
 
-class SteppedSimulator(Protocol):
-    """B abstract states that can be set and stepped."""
+class AbstractSimulator(Protocol):
+    """B abstract states that can be set and stepped, which datasets can be paired with."""
 
     @property
     def state(self) -> Tensor:
@@ -24,10 +24,6 @@ class SteppedSimulator(Protocol):
 
     def step(self, action: Tensor) -> Tensor:
         """Apply `action` (B, A); return the new states (B, X)."""
-
-
-class AbstractSimulator(SteppedSimulator, Protocol):
-    """A simulator that datasets can be paired with."""
 
     @property
     def parameters(self) -> Mapping[str, float]:
@@ -68,8 +64,15 @@ class Simulator(AbstractSimulator, Protocol):
         """Map target states (B, S) to abstract states (B, X), numpy in, numpy out."""
 
 
-class PlacedSimulator(SteppedSimulator, Protocol):
-    """A simulator whose states a correction may move after each step."""
+def innermost(simulator: Any) -> Any:  # noqa: ANN401 - any object
+    """Return the simulator that `simulator` drives or varies, itself if it is none of others."""
+    while hasattr(simulator, "simulator"):
+        simulator = simulator.simulator
+    return simulator
+
+
+class TaskSimulator(AbstractSimulator, Protocol):
+    """The abstract simulator of a task: corrections may move its states, and its parameters be set row by row."""
 
     @property
     def blocked(self) -> Tensor:
@@ -77,18 +80,6 @@ class PlacedSimulator(SteppedSimulator, Protocol):
 
     def settle(self, before: Tensor, landed: Tensor) -> Tensor:
         """Move from `before` as far toward `landed`, both (B, X), as there is room, or draw where; return it (B, X)."""
-
-
-def keep_clear(simulator: object, distance_m: float) -> None:
-    """Let corrections of `simulator`, or of what it drives, end no closer to walls, if there are, than `distance_m`."""
-    while not (keep := getattr(simulator, "keep_clear", None)) and hasattr(simulator, "simulator"):
-        simulator = simulator.simulator
-    if keep:
-        keep(distance_m)
-
-
-class TaskSimulator(PlacedSimulator, AbstractSimulator, Protocol):
-    """The abstract simulator of a task, whose parameters can be set row by row."""
 
     def vary(self, parameters: Mapping[str, Tensor]) -> None:
         """Use `parameters` by name, (B, 1) each, from the next step on; those without effect are ignored."""

@@ -220,6 +220,11 @@ class PhysicsTarget:
         """The full target states: qpos, then qvel, (B, S) float32."""
         return torch.from_numpy(np.concatenate([self.physics.qpos, self.physics.qvel], axis=1)).float()
 
+    @property
+    def position(self) -> Tensor:
+        """Positions of the robots, (B, 2) float32 in m."""
+        return torch.from_numpy(self.physics.qpos[:, :2]).float()
+
     def reset_to(self, rows: NDArray[np.intp], state: Floats) -> None:
         """Set the robots `rows` (n,) to `state` (n, S)."""
         self.physics.set_state(rows, *np.split(state, [self.physics.model.nq], axis=1))

@@ -43,30 +43,21 @@ class RobotEnv:
     """B robots, stepped one after another, as a batched target environment; they do not tell of walls."""
 
     def __init__(
-        self,
-        objective: Objective,
-        num_envs: int,
-        *,
-        robot: Callable[[], Robot],
-        state: Column,
-        commands: Commands,
-        abstraction: Callable[[Any], Any],
-        seed: int,
-        num_threads: int | None = None,
-        start_anywhere: bool = False,
+        self, task: "Task", num_envs: int, *, seed: int, num_threads: int | None = None, start_anywhere: bool = False
     ) -> None:
-        """Build B robots, with the column of their states, the bounds of their commands, and φ."""
-        self.num_envs, self.action_size = num_envs, len(commands)
-        self._objective, self._column, self._commands, self._abstraction = objective, state, commands, abstraction
-        self._robots = [robot() for _ in range(num_envs)]
+        """Build B robots of `task`."""
+        assert task.robot is not None
+        self.num_envs, self.action_size = num_envs, len(task.limits)
+        self._task, self._objective = task, task.objective
+        self._robots = [task.robot() for _ in range(num_envs)]
         taken = inspect.signature(self._robots[0].reset).parameters
         self._takes_seed = "seed" in taken or any(one.kind is one.VAR_KEYWORD for one in taken.values())
         self._any_end_fails = getattr(self._robots[0], "any_end_fails", False)
-        self.goal = torch.zeros(num_envs, objective.goal_size)
+        self.goal = torch.zeros(num_envs, self._objective.goal_size)
         self.failed = torch.zeros(num_envs, dtype=torch.bool)
         self._fell = self.failed.clone()
         self.wall_contact = torch.zeros(num_envs, dtype=torch.bool)
-        self._state, self._steps = torch.zeros(num_envs, state.size), [0] * num_envs
+        self._state, self._steps = torch.zeros(num_envs, task.state.size), [0] * num_envs
         self.reseed(seed)
         self.observation_size = self._observe().shape[1]
 
@@ -87,7 +78,7 @@ class RobotEnv:
     def check_commands(self) -> None:
         """Let a robot that has `check_commands` check the bounds of its commands; no robot moves."""
         if check := getattr(self._robots[0], "check_commands", None):
-            check(self._commands)
+            check(self._task.limits)
 
     def reset(self, mask: Tensor | None = None) -> Tensor:
         """Restart the robots in `mask` (B,), by default all; return observations (B, O)."""
@@ -107,7 +98,7 @@ class RobotEnv:
     def step(self, action: Tensor, active: Tensor | None = None) -> Step:
         """Apply `action` (B, A) of ±1; robots outside `active` (B,) stay as they are."""
         before = self._abstract()
-        commands = self._commands.in_units(action).double().numpy()
+        commands = self._task.limits.in_units(action).double().numpy()
         for row in rows_in(active, self.num_envs).tolist():
             with explained("step of the robot"):
                 found = self._robots[row].step(commands[row])
@@ -150,7 +141,7 @@ class RobotEnv:
 
     @without_gradients
     def _abstract(self) -> Tensor:
-        return torch.as_tensor(self._abstraction(self.state))
+        return torch.as_tensor(self._task.abstraction(self.state))
 
     def _observe(self) -> Tensor:
         return self._objective.observe(self._abstract(), self.goal)
@@ -158,12 +149,12 @@ class RobotEnv:
     def _checked(self, state: State, call: str, row: int) -> Tensor:
         with explained(f"{call} of the robot: to read its state as numbers"):
             found = torch.as_tensor(np.asarray(state, dtype=np.float32))
-        expected = f"{call} of the robot: expected a finite state of {self._column.size} numbers"
-        if found.shape != (self._column.size,):
+        expected = f"{call} of the robot: expected a finite state of {self._task.state.size} numbers"
+        if found.shape != (self._task.state.size,):
             raise BadInputError(f"{expected}, got {' '.join(repr(state).split())}")
         if lost := (~found.isfinite()).nonzero().flatten().tolist():
             raise BadInputError(
-                f"{expected}, got {first_few([self._column.labels[entry] for entry in lost], 4)} = "
+                f"{expected}, got {first_few([self._task.state.labels[entry] for entry in lost], 4)} = "
                 f"{float(found[lost[0]])} after step {self._steps[row]} of an episode of robot {row + 1} of "
                 f"{self.num_envs}: see what its simulation does there, or let it fail one step before"
             )
@@ -358,11 +349,10 @@ class Task:
             "simulator_id": _named(made),
         }
         derived = {name: value for name, value in usual.items() if not getattr(self, name)}
-        known = {"state": replace(self.state, name=STATE), "commands": commands}
-        for name, called in (("action", ACTION), ("goal", GOAL), ("abstract_state", ABSTRACT_STATE)):
-            if (column := getattr(self, name)) and column.name != called:
-                known[name] = replace(column, name=called)
-        for name, value in {**known, **derived, "derived": derived}.items():
+        called = {"state": STATE, "action": ACTION, "goal": GOAL, "abstract_state": ABSTRACT_STATE}
+        other = {name: column for name, column in named.items() if column and column.name != called[name]}
+        known = {name: replace(column, name=called[name]) for name, column in other.items()}
+        for name, value in {**known, "commands": commands, **derived, "derived": derived}.items():
             object.__setattr__(self, name, value)
 
     @property
@@ -394,7 +384,7 @@ class Task:
         if self.plane is None:
             raise BadInputError(
                 f"expected a task in a maze, got '{self.name}', which has none: leave out what needs a maze "
-                "(augment, follower, support_penalty, command_limit, clearance_m, start 'anywhere')"
+                "(augment, follower, clearance_m, start 'anywhere')"
             )
         return self.plane
 
@@ -420,8 +410,7 @@ class Task:
                 f"task '{self.name}' has no target: give it a `robot`, or leave out what needs one (collect, "
                 "rows trained in the target)"
             )
-        parts: dict[str, Any] = {"state": self.state, "commands": self.limits, "abstraction": self.abstraction}
-        return RobotEnv(self.objective, num_envs, robot=self.robot, **parts, **options)
+        return RobotEnv(self, num_envs, **options)
 
     def own_simulator(self, num_envs: int, device: str = "cpu") -> AbstractSimulator:
         """Build `num_envs` abstract simulators, driven by commands in their units."""

@@ -129,8 +129,8 @@ def test_it_sees_the_latent_where_only_the_latent_tells(by_latent: bool, monkeyp
 
 def test_the_seed_decides_folds_and_networks(monkeypatch: pytest.MonkeyPatch) -> None:
     episodes, divided = hurried(20, 0), list[Tensor]()
-    steps = module._steps(failing(TASK, episodes), torch.zeros(20, 100, 20))
-    assert not module._descended(untrained(episodes).train(), *steps).training  # whose predictions are calibrated
+    fitted = module._descended(untrained(episodes).train(), failing(TASK, episodes), torch.zeros(20, 100, 20))
+    assert not fitted.training  # whose predictions are calibrated
     monkeypatch.setattr(module, "_cross_fitted", lambda *given: divided.append(torch.stack(given[-1])))
     monkeypatch.setattr(module, "_descended", lambda network, *_: network)
     first, again, other = (fit_failures(TASK, GROUNDING, episodes, seed)[0].members.first for seed in (0, 0, 1))
@@ -153,8 +153,8 @@ def test_the_likelihood_is_that_of_the_moments_over_a_constant_rate(monkeypatch:
         def log_odds(self, inputs: Tensor) -> Tensor:
             return inputs[..., :2].movedim(-1, 0) - 2.0
 
-    def descended(_: FailureModel, inputs: Tensor, fails_soon: Tensor) -> Known:
-        fitted.append(inputs)
+    def descended(_: FailureModel, others: PairedEpisodes, inputs: Tensor) -> Known:
+        fitted.append(others.steps(inputs))
         return Known()
 
     monkeypatch.setattr(module, "_descended", descended)

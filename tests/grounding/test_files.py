@@ -15,9 +15,8 @@ from astra_data.grounding.alignment import TargetEncoder
 from astra_data.grounding.encoder import take_scales
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.model import GroundingModel, GroundingShape
-from astra_data.grounding.simulator import EpisodeSimulator
+from astra_data.grounding.simulator import EpisodeSimulator, PlacedSimulator
 from astra_data.robots.registry import task_named
-from astra_data.worlds.protocols import PlacedSimulator
 
 
 def test_a_history_model_comes_back_frozen(tmp_path: Path) -> None:

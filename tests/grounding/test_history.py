@@ -13,7 +13,7 @@ from astra_data.grounding.model import GroundingModel
 from astra_data.grounding.simulator import NO_GROUNDING, EpisodeSimulator
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.plane.mazes import U_MAZE
-from astra_data.worlds.plane.point_mass import PointMass
+from astra_data.worlds.plane.navigation import PointMass
 
 
 @pytest.mark.parametrize("latent_size", [None, 0, 8])
@@ -141,7 +141,7 @@ def test_a_failure_model_is_asked_before_each_correction_and_prices_failures(lat
         seen, memory = failures.inputs(one.state, action, raw.step(action), latent, memory)
         said = failures.probability(seen)
         torch.testing.assert_close(one.step(action), plain.step(action))
-        torch.testing.assert_close(one.failure_risk(), said / 2)  # within two steps
+        torch.testing.assert_close(one.hazard, said / 2)  # within two steps
         expected = used.target_reward(latent, action, torch.zeros(3)) - 10.0 * said / 2
         torch.testing.assert_close(one.predicted_reward(torch.zeros(3)), expected)
 
@@ -153,11 +153,11 @@ def test_a_failure_models_memory_is_kept_and_forgotten_at_a_start() -> None:
         one.step(action)
     saved = {name: values.clone() for name, values in one.state_dict().items()}
     one.step(played[4])
-    wanted = one.failure_risk()
+    wanted = one.hazard
     resumed = simulator(used, failures)
     resumed.load_state_dict(saved)
     resumed.step(played[4])
-    torch.testing.assert_close(resumed.failure_risk(), wanted)
+    torch.testing.assert_close(resumed.hazard, wanted)
 
     known = torch.rand(3, 8 + 15)
     one.start(HERE.expand(3, 4), ROWS, GOAL, hidden=known, previous_action=played[0])
@@ -167,8 +167,8 @@ def test_a_failure_models_memory_is_kept_and_forgotten_at_a_start() -> None:
     one.step(played[0])
     fresh = simulator(used, failures)
     fresh.step(played[0])
-    torch.testing.assert_close(one.failure_risk(), fresh.failure_risk())
-    risk = fresh.failure_risk()
+    torch.testing.assert_close(one.hazard, fresh.hazard)
+    risk = fresh.hazard
     assert risk is not None and wanted is not None and not torch.allclose(risk, wanted)
 
 
@@ -190,7 +190,7 @@ def test_a_start_draws_the_parameters_of_its_rows_anew() -> None:
     # From -1 at the lower to 1 at the upper end.
     friction = after[:, names.index("friction")]
     low, high = TASK.varied.wide.friction  # type: ignore[attr-defined]
-    inner = one.simulator.parameters[:, names.index("friction")]  # type: ignore[attr-defined]
+    inner = one.simulator.parameters[:, names.index("friction")]  # type: ignore[index]
     torch.testing.assert_close(friction, (inner - low) / (high - low) * 2 - 1, atol=1e-5, rtol=0)
 
 

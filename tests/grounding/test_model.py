@@ -64,7 +64,7 @@ def fit(model: GroundingModel, updates: int = 130) -> float:
 
 @torch.no_grad()
 def latents(model: GroundingModel) -> Tensor:
-    latent, _ = model.encoder(model.encoder_input(HELD_OUT.state, HELD_OUT.goal, HELD_OUT.previous_action))
+    latent, _ = model.encoder.sequence(model.encoder_input(HELD_OUT.state, HELD_OUT.goal, HELD_OUT.previous_action))
     return torch.as_tensor(latent)
 
 
@@ -144,7 +144,7 @@ def real(values: Tensor) -> Tensor:
 
 def latents_of(used: GroundingModel) -> Tensor:
     given = windows()
-    latent: Tensor = used.encoder(used.encoder_input(given.state, given.goal, given.previous_action))[0]
+    latent: Tensor = used.encoder.sequence(used.encoder_input(given.state, given.goal, given.previous_action))[0]
     return latent
 
 

@@ -13,7 +13,7 @@ from astra_data.grounding.model import GroundingModel, GroundingShape
 from astra_data.grounding.open_loop import _interval, _starts, distances, gap_report, replay_open_loop
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.simulator import NO_GROUNDING, Grounding
-from astra_data.worlds.plane.point_mass import PointMass
+from astra_data.worlds.plane.navigation import PointMass
 
 STEPS = 60
 

@@ -40,7 +40,7 @@ def flags(*values: int) -> Tensor:
 
 
 def test_what_happens_after_the_end_does_not_count() -> None:
-    record = EpisodeRecord(torch.zeros(3, 2))
+    record = EpisodeRecord(torch.zeros(3, 2), torch.zeros(3, 0))
     none = flags(0, 0, 0)
     for step, (success, failed, contact, reward) in enumerate(
         [
@@ -84,14 +84,14 @@ def driving(speed: float) -> Act:
 
 def test_episodes_end_in_success_in_failure_or_with_their_time() -> None:
     there = in_target(CART, lambda goal: driving(0.9), 5, seed=3)
-    assert there.outcome.success == [1.0] * 5 and there.outcome.failed == [0.0] * 5
+    assert there.success == [1.0] * 5 and there.failed == [0.0] * 5
     tipped = in_target(CART, lambda goal: driving(3.5), 5, seed=3)
-    assert tipped.outcome.failed == [1.0] * 5 and tipped.outcome.steps == [1] * 5
+    assert tipped.failed == [1.0] * 5 and tipped.steps == [1] * 5
     late = in_target(CART, lambda goal: driving(-0.5), 5, seed=3)
-    assert late.outcome.success == [0.0] * 5 and late.outcome.steps == [CART.objective.horizon] * 5
+    assert late.success == [0.0] * 5 and late.steps == [CART.objective.horizon] * 5
     other = in_target(CART, lambda goal: driving(3.5), 5, seed=4)
-    assert torch.equal(late.start_goal["goal"], tipped.start_goal["goal"])
-    assert not torch.equal(other.start_goal["goal"], tipped.start_goal["goal"])
+    assert torch.equal(late.goal, tipped.goal)
+    assert not torch.equal(other.goal, tipped.goal)
 
 
 @pytest.mark.parametrize("task", [CART, TASKS["nao-navigation"], TASKS["humanoid-walker2d"]])
@@ -114,9 +114,9 @@ def test_the_goals_are_those_of_the_seed_in_any_simulator() -> None:
         for simulation in (SIMULATION, Simulation(WorldConfig(), CART.varied.randomized))
         for seed in (0, 1)
     ]
-    goals = [start_goal["goal"] for _, start_goal in runs]
+    goals = [outcome.goal for outcome in runs]
     assert torch.equal(goals[0], goals[2]) and not torch.equal(goals[0], goals[1])
-    outcome = runs[0][0]
+    outcome = runs[0]
     # It stops where the last episode ends; every command of 4 m/s is beyond 2 m/s.
     assert outcome.position.shape[1] - 1 == max(outcome.steps) <= 5 and asked.share == 1.0
     assert outcome.steps == [int(torch.ceil(goal / (0.1 * SPEED) - 1e-4)) for goal in goals[0][:, 0]]
@@ -125,9 +125,9 @@ def test_the_goals_are_those_of_the_seed_in_any_simulator() -> None:
 
 def test_where_it_is_to_last_an_episode_succeeds_in_its_last_step() -> None:
     world = training_env(replace(CART, objective=Last(horizon=6)), SIMULATION, NO_GROUNDING, num_envs=3)
-    found, _ = in_simulator(world, lambda goal: lambda state, goal: torch.full_like(goal, -0.6), 6, seed=0)
+    found = in_simulator(world, lambda goal: lambda state, goal: torch.full_like(goal, -0.6), 6, seed=0)
     assert found.success == [1.0] * 3 and found.steps == [6] * 3
-    tested = in_target(replace(CART, objective=Last(horizon=6)), lambda goal: driving(0.0), 3, seed=0).outcome
+    tested = in_target(replace(CART, objective=Last(horizon=6)), lambda goal: driving(0.0), 3, seed=0)
     assert tested.success == [1.0] * 3 and tested.steps == [6] * 3
 
 
@@ -203,8 +203,7 @@ def test_success_is_judged_from_each_start_alone(
             begun.append({"state": world.simulator.state.clone(), "goal": goal.clone()})
             return begin(goal)
 
-        outcome, _ = run(world, noted, *given, **more)
-        return replace(outcome, success=[1.0, 1.0, 0.0] * 9 + [1.0, 0.0, 0.0]), {}
+        return replace(run(world, noted, *given, **more), success=[1.0, 1.0, 0.0] * 9 + [1.0, 0.0, 0.0])
 
     monkeypatch.setattr(judging, "in_simulator", seen)
     assert judging.judged_from(CART, judge, policy, state, goal, 7).tolist() == pytest.approx([1.0, 0.9, 0.0])

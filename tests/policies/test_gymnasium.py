@@ -49,7 +49,7 @@ def test_failures_are_told_apart_from_successes() -> None:
     task = TASKS["antmaze-umaze"]
     walls = replace(task.objective, ends_at_walls=True)
     simulator = NO_GROUNDING.simulator(task, 2)
-    simulator.simulator.period_s = torch.tensor(0.05, requires_grad=True)  # type: ignore[attr-defined] # as if learned
+    simulator.simulator.period_s = torch.tensor(0.05, requires_grad=True)  # type: ignore[union-attr] # as if learned
     env = BatchedVectorEnv(SeededSimulatorEnv(SimulatorEnv(walls, simulator)), max_episode_steps=200)
     env.reset(seed=0)
     commands = np.array([[0.0, 0.0], [-1.0, 1.0]], dtype=np.float32)
@@ -60,7 +60,7 @@ def test_failures_are_told_apart_from_successes() -> None:
     assert terminated.tolist() == [False, True] and infos["final_info"]["failed"].tolist() == [False, True]
     assert not infos["failed"].any() and not infos["final_info"]["success"].any()
     one, beside = SimulatorEnv(walls, simulator), torch.tensor([[-5.99, 4.0, -1.0, 0.0]] * 2)
-    one.start_from(beside, torch.tensor([[-6.0, 4.0], [4.0, 4.0]]))
+    one.start_from(beside, torch.tensor([[-6.0, 4.0], [4.0, 4.0]]), torch.arange(2))
     step = one.step(torch.tensor([[-1.0, 0.0]] * 2))
     assert simulator.blocked.all() and step.success.tolist() == [True, False] and one.failed.tolist() == [False, True]
 

@@ -13,8 +13,8 @@ from toy_worlds import ConstantReward, EndsAtZero, GoToZero, Recall, assert_resu
 
 from astra_data.core.errors import BadInputError
 from astra_data.policies import ppo as module
-from astra_data.policies.networks import ActorCritic, PolicyShape
-from astra_data.policies.ppo import Ppo, PpoConfig, ReturnScale, generalized_advantages
+from astra_data.policies.networks import ActorCritic, PolicyShape, ReturnScale
+from astra_data.policies.ppo import Ppo, PpoConfig, generalized_advantages
 from astra_data.worlds.protocols import BatchedEnv
 
 
@@ -184,7 +184,7 @@ def test_the_actions_scatter_falls_to_what_is_tested_and_may_be_less(
 def test_rewards_are_scaled_as_by_stable_baselines() -> None:
     rows = DummyVecEnv([lambda: gymnasium.make("Pendulum-v1")] * 4)
     theirs = VecNormalize(rows, norm_obs=False, gamma=0.9)
-    ours, rng = ReturnScale(4, 0.9, torch.device("cpu")), np.random.default_rng(0)
+    ours, rng = ReturnScale(4, 0.9), np.random.default_rng(0)
     for step in range(60):
         reward = (rng.normal(size=4) * (100.0 if step == 30 else 3.0)).astype(np.float32)
         if step == 50:
@@ -198,5 +198,5 @@ def test_rewards_are_scaled_as_by_stable_baselines() -> None:
         if step == 40:
             saved = {name: values.clone() for name, values in ours.state_dict().items()}
             ours.scaled(torch.ones(4), torch.zeros(4, dtype=torch.bool))  # goes on elsewhere
-            ours = ReturnScale(4, 0.9, torch.device("cpu"))
+            ours = ReturnScale(4, 0.9)
             ours.load_state_dict(saved)

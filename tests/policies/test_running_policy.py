@@ -54,9 +54,9 @@ def test_latents_are_those_of_the_whole_history(aligned: bool, in_simulator: boo
     actions = run(running, in_simulator=in_simulator)
     abstract = STATE[..., [0, 1, 15, 16]]
     if aligned and not in_simulator:
-        latent, _ = target.encoder(target.encoder_input(STATE, GOALS, previous(actions)))
+        latent, _ = target.encoder.sequence(target.encoder_input(STATE, GOALS, previous(actions)))
     else:
-        latent, _ = model.encoder(model.encoder_input(abstract, GOALS, previous(actions)))
+        latent, _ = model.encoder.sequence(model.encoder_input(abstract, GOALS, previous(actions)))
     observation = policy_observation(TASK.objective, abstract, GOALS, latent)
     torch.testing.assert_close(actions, policy.policy(observation)[0], atol=1e-5, rtol=0)
     assert actions.abs().max() > 0.1
@@ -89,9 +89,9 @@ def test_with_inputs_the_policy_observes_an_estimate_in_place_of_phi(aligned: bo
     read = eyes.encoder_input(STATE, GOALS, previous(actions))
     abstract = eyes.estimates(read, eyes.estimator.sequence(read)[1])
     if aligned:
-        latent, _ = eyes.encoder(read)
+        latent, _ = eyes.encoder.sequence(read)
     else:
-        latent, _ = model.encoder(model.encoder_input(abstract, GOALS, previous(actions)))
+        latent, _ = model.encoder.sequence(model.encoder_input(abstract, GOALS, previous(actions)))
     observation = policy_observation(TASK.objective, abstract, GOALS, latent)
     expected = TASK.objective.limit_command(policy.policy(observation)[0], 0.2)
     torch.testing.assert_close(actions, expected, atol=1e-5, rtol=0)
@@ -177,7 +177,7 @@ def test_the_encoder_sees_the_shortened_command_and_the_policy_its_own() -> None
     actions = run(running)
     assert actions.norm(dim=-1).max() <= 0.2 + 1e-6
     abstract = STATE[..., [0, 1, 15, 16]]
-    latent, _ = model.encoder(model.encoder_input(abstract, GOALS, previous(actions)))
+    latent, _ = model.encoder.sequence(model.encoder_input(abstract, GOALS, previous(actions)))
     observation = policy_observation(TASK.objective, abstract, GOALS, latent)
     hidden, own, outputs = policy.initial_hidden(3), torch.zeros(3, 2), []
     for step in range(6):

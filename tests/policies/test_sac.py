@@ -9,7 +9,7 @@ from toy_worlds import EndsAtZero, GoToZero, assert_resumes
 
 from astra_data.core.errors import BadInputError
 from astra_data.policies import sac as module
-from astra_data.policies.networks import PolicyShape, SoftActor, features_of
+from astra_data.policies.networks import PolicyShape, SoftActor
 from astra_data.policies.sac import Replay, Sac, SacConfig
 from astra_data.worlds.protocols import BatchedEnv
 
@@ -112,8 +112,8 @@ def test_an_update_is_that_of_the_printed_losses(memory: int, monkeypatch: pytes
 
     with torch.no_grad():
         acting = actor.remember_sequence(*seen, steps["hidden"][:, 0], first)
-        judging = features_of(online.memory, *seen, nothing, first)
-        late = features_of(slow.memory, *seen, nothing, first)
+        judging = online.remember_sequence(*seen, nothing, first)
+        late = slow.remember_sequence(*seen, nothing, first)
         following, log_prob = squashed(acting[:, 1:][learned])
         beyond = action_values(slow, late[:, 1:][learned], following).amin(0) - temperature * log_prob
         over, reward = steps["terminated"][:, :-1][learned], steps["reward"][:, :-1][learned]

@@ -15,8 +15,7 @@ from astra_data.policies import simulator_env
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.objective import NO_LIMIT
 from astra_data.worlds.plane.mazes import U_MAZE
-from astra_data.worlds.plane.navigation import Navigation
-from astra_data.worlds.plane.point_mass import PointMass, VariedPlanar
+from astra_data.worlds.plane.navigation import Navigation, PointMass, VariedPlanar
 from astra_data.worlds.variation import PlanarVariation
 
 NAVIGATION = Navigation(U_MAZE, horizon=700)
@@ -33,8 +32,10 @@ class Risky(GroundedSimulator):
 
     risk = 0.05
 
-    def failure_risk(self) -> torch.Tensor:
-        return torch.full((len(self.state),), self.risk)
+    def step(self, action: torch.Tensor) -> torch.Tensor:
+        landed = super().step(action)
+        self.hazard = torch.full((len(landed),), self.risk)
+        return landed
 
 
 def risky(count: int, risk: float, reward: Any = "abstract", **options: Any) -> simulator_env.SimulatorEnv:
@@ -132,7 +133,7 @@ def test_a_predicted_reward_is_the_tasks_own_corrected_and_what_the_risk_costs()
     one.reset()
     before, latent, action = one.simulator.state, grounded.latent, torch.full((3, 2), 0.2)
     step = one.step(action)
-    hazard = grounded.failure_risk()
+    hazard = grounded.hazard
     assert hazard is not None and (hazard > 0).all()
     normal = model.reward_head(torch.cat([latent, action], dim=-1))[:, -1]
     own = NAVIGATION.reward(before, one.simulator.state, one.goal, torch.zeros(3, dtype=torch.bool))

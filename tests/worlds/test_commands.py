@@ -10,7 +10,7 @@ from small_cart import TASK, Rail
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ACTION
 from astra_data.worlds.commands import Commands, DrivenSimulator, VariedCommands
-from astra_data.worlds.protocols import keep_clear
+from astra_data.worlds.protocols import innermost
 from astra_data.worlds.variation import CommandVariation
 
 DRIVE = Commands({"v": (-0.2, 1.0), "w": (-1.5, 1.5)})
@@ -103,10 +103,6 @@ class Walled(Rail):
 
     blocked = torch.tensor([True, False])
     varied = 0
-    kept_m = 0.0
-
-    def keep_clear(self, distance_m: float) -> None:
-        self.kept_m = distance_m
 
     def settle(self, before: torch.Tensor, landed: torch.Tensor) -> torch.Tensor:
         self.reset_to(landed.clamp_max(1.0))
@@ -123,9 +119,8 @@ def test_walls_and_parameters_of_the_simulator_are_its_own() -> None:
     assert simulator.blocked.tolist() == [True, False]
     simulator.vary({"friction": torch.ones(2, 1)})
     assert walled.varied == 1
-    keep_clear(simulator, 0.3)
-    assert walled.kept_m == 0.3
-    keep_clear(driven(), 0.3)  # no walls, nothing to keep clear of
+    varied = VariedCommands(simulator, CommandVariation())
+    assert [innermost(one) for one in (varied, simulator, walled)] == [walled] * 3
 
 
 def test_commands_vary_from_episode_to_episode() -> None:
@@ -147,7 +142,7 @@ class InPlace:
     """A simulator that has one tensor of states, and writes into it."""
 
     def __init__(self) -> None:
-        self.state = torch.zeros(2, 1)
+        self.state, self.parameters = torch.zeros(2, 1), dict[str, float]()
 
     def reset_to(self, state: torch.Tensor, rows: torch.Tensor | None = None) -> None:
         self.state[slice(None) if rows is None else rows] = state

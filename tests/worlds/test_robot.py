@@ -48,7 +48,7 @@ def test_what_the_objective_misses_is_a_failure_until_the_next_episode() -> None
     assert env.failed.tolist() == [False, False]
     fell = env.step(torch.tensor([[1.0], [-0.6]]))
     assert fell.terminated.tolist() == [True, False] and env.failed.tolist() == [True, False]
-    found = in_target(replace(TASK, objective=Edge(horizon=40)), lambda goal: driving_back, 3, seed=0).outcome
+    found = in_target(replace(TASK, objective=Edge(horizon=40)), lambda goal: driving_back, 3, seed=0)
     assert found.failed == [1.0] * 3 and found.success == [0.0] * 3 and found.steps == [3] * 3
 
 

@@ -245,7 +245,7 @@ def _lasts(running: RunningPolicy, seed: int, num_threads: int | None) -> float:
         return begin_drawing(running, len(goal), seed)
 
     tested = in_target(running.task, begin, _TEST_EPISODES, starts, num_threads=num_threads)
-    return fmean(tested.outcome.steps)
+    return fmean(tested.steps)
 
 
 class CollectConfig(Config):

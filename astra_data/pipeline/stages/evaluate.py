@@ -127,19 +127,19 @@ def evaluate(
             for kind, robot in row.robots.items()
         }
         if len(tested) > 1:
-            outcomes = {kind: episodes.outcome.to_json() for kind, episodes in tested.items()}
+            outcomes = {kind: outcome.to_json() for kind, outcome in tested.items()}
             measures = [score.measure for score in world.objective.scores]
             results["encoders"] = {kind: {one: fmean(of[one]) for one in measures} for kind, of in outcomes.items()}
         headline = tested[row.headline]
-        results["target"] = headline.outcome.to_json()
-        tensors = {"target.position": headline.outcome.position} | headline.start_goal
+        results["target"] = headline.to_json()
+        tensors = {"target.position": headline.position} | headline.start_goal
     else:
         results |= {"tested_in": tested_in, "encoder": "source"}
     for name, simulator in simulators.items():
         drawn, counted = derive(seed, "simulated evaluation"), asked if name == tested_in else None
-        outcome, start_goal = in_simulator(simulator, row.begin, world.objective.horizon, drawn, counted)
+        outcome = in_simulator(simulator, row.begin, world.objective.horizon, drawn, counted)
         results[name] = outcome.to_json()
-        tensors |= start_goal if name == tested_in else {}
+        tensors |= outcome.start_goal if name == tested_in else {}
         tensors |= {f"{name}.position": outcome.position} if name in ("simulated", tested_in) else {}
     if asked is not None:
         results["beyond_recorded"] = asked.share

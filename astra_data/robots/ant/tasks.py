@@ -14,20 +14,19 @@ from astra_data.core.lazy import Tensor, mujoco, torch
 from astra_data.dataset.columns import ABSTRACT_STATE, ACTION, GOAL, STATE
 from astra_data.worlds.geometry import rotation_matrix
 from astra_data.worlds.plane.mazes import LONG_MAZE, U_MAZE, Maze
-from astra_data.worlds.plane.navigation import Navigation, PlanarObjective, PlanarTarget
-from astra_data.worlds.plane.point_mass import PointMass, VariedPlanar
+from astra_data.worlds.plane.navigation import Navigation, PlanarObjective, PlanarTarget, PointMass, VariedPlanar
 from astra_data.worlds.protocols import Step, rows_in
 from astra_data.worlds.simulators import BatchedPhysics, PhysicsTarget, add_walls, wall_geoms
 from astra_data.worlds.task import PLANAR_GOAL, PLANAR_STATE, Task, Varied, column, entries, free_body
 from astra_data.worlds.variation import RANDOMIZED_ACTIONS, WIDE_RANGES
 
 STATE_SIZE = 29  # qpos (15): x, y, z, quaternion, 8 joint angles; qvel (14): linear, angular, 8 joint rates
-POSITIONS = 15
 CONTROL_SUBSTEPS = 5  # physics steps per control step: 5 x 0.01 s = 20 Hz, as in Gymnasium
 TIMESTEP_S = 0.05
 INTEGRATOR = "RK4"  # Gymnasium's; "Euler" is 3.7 times faster, but has other contact dynamics
 TOPPLE_COSINE = 0.2  # the ant has toppled when the cosine between its up axis and the vertical falls below this
-TORSO_HEIGHT_M = 0.75
+STANDING = (0.0, 0.0, 0.75, 1.0, *[0.0] * 4, 1.0, 0.0, -1.0, 0.0, -1.0, 0.0, 1.0, *[0.0] * 14)
+"""The state of an ant that stands upright at the origin, legs within their joint limits."""
 WALL_REACH_M = 1.3
 """With more clearance than this on the maze's grid the ant touches no wall: a stretched leg ends 1.21 m from
 the torso's center, and the grid is up to 0.1 m off."""
@@ -50,15 +49,6 @@ def ant_model(maze: Maze | None = None, *, leg_scale: float = 1.0) -> "mujoco.Mj
         look = {"material": "", "contype": "1", "conaffinity": "1", "rgba": "0.7 0.5 0.3 1.0"}
         add_walls(world, maze, WALL_HEIGHT * maze.scale, **look)
     return mujoco.MjModel.from_xml_string(ElementTree.tostring(root, encoding="unicode"))
-
-
-def standing_pose(count: int) -> Floats:
-    """Return `count` upright poses (count, 15) at the origin, legs within their joint limits."""
-    qpos = np.zeros((count, POSITIONS))
-    qpos[:, 2] = TORSO_HEIGHT_M
-    qpos[:, 3] = 1.0
-    qpos[:, 7:] = np.array([0.0, 1.0, 0.0, -1.0, 0.0, -1.0, 0.0, 1.0])
-    return qpos
 
 
 def canonical_view(qpos: Floats, qvel: Floats, command: Floats) -> tuple[Floats, NDArray[np.intp]]:
@@ -155,11 +145,6 @@ class AntMazeEnv(PhysicsTarget, PlanarTarget):
         self.reseed(seed)
 
     @property
-    def position(self) -> Tensor:
-        """Positions of the ants, (B, 2) float32 in m."""
-        return torch.from_numpy(self.physics.qpos[:, :2]).float()
-
-    @property
     def wall_contact(self) -> Tensor:
         """Which ants touched a wall in their last step, (B,) bool."""
         return torch.from_numpy(self.physics.touching.copy())
@@ -167,13 +152,12 @@ class AntMazeEnv(PhysicsTarget, PlanarTarget):
     def reset(self, mask: Tensor | None = None) -> Tensor:
         """Set the ants in `mask` (B,), by default all, upright at new starts with random headings."""
         rows = rows_in(mask, self.num_envs)
-        count = len(rows)
-        qpos = standing_pose(count)
-        qpos[:, :2] = self._start(rows)[:, :2]
-        yaw = self._rng.uniform(-np.pi, np.pi, count)
-        qpos[:, 3], qpos[:, 6] = np.cos(yaw / 2), np.sin(yaw / 2)
+        state = np.tile(STANDING, (len(rows), 1))
+        state[:, :2] = self._start(rows)[:, :2]
+        yaw = self._rng.uniform(-np.pi, np.pi, len(rows))
+        state[:, 3], state[:, 6] = np.cos(yaw / 2), np.sin(yaw / 2)
         self._aim(rows)
-        self.reset_to(rows, np.concatenate([qpos, np.zeros((count, STATE_SIZE - POSITIONS))], axis=1))
+        self.reset_to(rows, state)
         return self._observe()
 
     def step(self, action: Tensor, active: Tensor | None = None) -> Step:

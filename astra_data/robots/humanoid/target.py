@@ -118,10 +118,10 @@ class Locomotion:
         state[:, _QUATERNION] /= np.linalg.norm(state[:, _QUATERNION], axis=1, keepdims=True)
         return state
 
-    def healthy(self, height: Floats) -> Bools:
-        """Return which torso heights (B,) in m are healthy."""
+    def healthy[Height: (Floats, Tensor)](self, height: Height) -> Any:  # noqa: ANN401 - Bools of Floats
+        """Return which torso heights (B,) in m are healthy, (B,) bool."""
         low, high = self.healthy_m
-        return np.asarray((height > low) & (height < high))
+        return (height > low) & (height < high)
 
     def reward(self, velocity: Floats, healthy: Bools, effort: Floats, contact: Floats) -> Floats:
         """Return the rewards (B,); `effort`, `contact`: sums of squared controls and of squared contact forces."""
@@ -169,11 +169,6 @@ class HumanoidEnv(PhysicsTarget):
         contact = data.cfrc_ext.ravel()
         return self._mass_share @ data.xipos[:, 0], control @ control, contact @ contact
 
-    @property
-    def position(self) -> Tensor:
-        """Positions of the humanoids, (B, 2) float32 in m."""
-        return self.state[:, :2]
-
     def reseed(self, seed: int) -> None:
         """Restart the random numbers of starts at `seed`."""
         self._rng = np.random.default_rng(seed)
@@ -209,24 +204,18 @@ class HumanoidEnv(PhysicsTarget):
 _TORSO = 1
 
 
-class _Link(NamedTuple):
-    """A body below the torso, as the model describes it."""
-
-    parent: int
-    offset: Tensor  # from the parent's origin to its own, (3,)
-    turn: Tensor  # from its axes to the parent's, (3, 3)
-    joints: tuple[int, ...]  # among all 17
-    anchors: tuple[Tensor, ...]  # a point on each joint's axis, (3,)
-
-
 class _Skeleton(NamedTuple):
-    """All bodies, in an order in which parents come first."""
+    """Bodies and joints as the model describes them; bodies are by its numbers, in which parents come first."""
 
-    links: dict[int, _Link]  # by the body's number
+    parents: list[int]
+    joints: list[range]  # of each body, among all 17
+    offsets: Tensor  # from the parents' origins to the bodies', (14, 3)
+    turns: Tensor  # from the bodies' axes to the parents', (14, 3, 3)
+    anchors: Tensor  # a point on each joint's axis, (17, 3)
     axes: Tensor  # of the joints in their bodies, (17, 3)
     crosses: Tensor  # matrices K with K v = axis x v, (17, 3, 3)
-    centers: dict[int, Tensor]  # of mass of each of the 13 bodies in its own frame, (3,)
-    shares: Tensor  # of the bodies in the total mass, (13,)
+    centers: Tensor  # of mass in the bodies' own frames, (14, 3)
+    shares: Tensor  # of the 13 bodies from the torso on in the total mass, (13,)
     moved: Tensor  # the shares that each joint moves, (17, 13)
     feet: tuple[tuple[int, Tensor], ...]  # body that each foot belongs to, and the foot's center, (3,)
 
@@ -239,31 +228,28 @@ def _skeleton(dtype: "torch.dtype", device: "torch.device") -> _Skeleton:
     def tensor(values: object) -> Tensor:
         return torch.as_tensor(np.array(values), dtype=dtype, device=device)
 
-    links = {}
-    moved = np.zeros((len(JOINTS), len(bodies)))
+    parents = model.body_parentid.tolist()
+    joints = [
+        range(first - 1, first - 1 + count) for first, count in zip(model.body_jntadr, model.body_jntnum, strict=True)
+    ]
+    turns, moved = np.zeros((model.nbody, 9)), np.zeros((len(JOINTS), len(bodies)))
     shares = model.body_mass[bodies] / model.body_mass.sum()
-    for body in bodies[1:]:
-        turn = np.zeros(9)
-        mujoco.mju_quat2Mat(turn, model.body_quat[body])
-        first = model.body_jntadr[body]
-        joints = range(first, first + model.body_jntnum[body])
-        links[body] = _Link(
-            parent=int(model.body_parentid[body]),
-            offset=tensor(model.body_pos[body]),
-            turn=tensor(turn.reshape(3, 3)),
-            joints=tuple(joint - 1 for joint in joints),
-            anchors=tuple(tensor(model.jnt_pos[joint]) for joint in joints),
-        )
+    for body, share in zip(bodies, shares, strict=True):
+        mujoco.mju_quat2Mat(turns[body], model.body_quat[body])
         carrier = body
         while carrier != _TORSO:
-            moved[links[carrier].joints, body - _TORSO] = shares[body - _TORSO]
-            carrier = links[carrier].parent
+            moved[joints[carrier], body - _TORSO] = share
+            carrier = parents[carrier]
     axes = model.jnt_axis[1:]
     return _Skeleton(
-        links=links,
+        parents=parents,
+        joints=joints,
+        offsets=tensor(model.body_pos),
+        turns=tensor(turns.reshape(-1, 3, 3)),
+        anchors=tensor(model.jnt_pos[1:]),
         axes=tensor(axes),
         crosses=tensor([np.cross(np.eye(3), axis) for axis in axes]),
-        centers={body: tensor(model.body_ipos[body]) for body in bodies},
+        centers=tensor(model.body_ipos),
         shares=tensor(shares),
         moved=tensor(moved),
         feet=tuple((int(foot.bodyid[0]), tensor(foot.pos)) for foot in map(model.geom, FEET)),
@@ -280,11 +266,12 @@ def _place(joints: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     origin = torch.zeros(*joints.shape[:-1], 3, dtype=joints.dtype, device=joints.device)
     frames = {_TORSO: (origin, identity.expand(*joints.shape[:-1], 3, 3))}
     axes, anchors = [origin] * len(JOINTS), [origin] * len(JOINTS)
-    for body, link in skeleton.links.items():
-        origin, turn = frames[link.parent]
-        origin = origin + turn @ link.offset
-        turn = turn @ link.turn
-        for joint, anchor in zip(link.joints, link.anchors, strict=True):
+    for body in range(_TORSO + 1, len(skeleton.parents)):
+        origin, turn = frames[skeleton.parents[body]]
+        origin = origin + turn @ skeleton.offsets[body]
+        turn = turn @ skeleton.turns[body]
+        for joint in skeleton.joints[body]:
+            anchor = skeleton.anchors[joint]
             axes[joint], anchors[joint] = turn @ skeleton.axes[joint], origin + turn @ anchor
             turn = turn @ turns[..., joint, :, :]
             origin = anchors[joint] - turn @ anchor
@@ -294,7 +281,7 @@ def _place(joints: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         origin, turn = frames[body]
         return origin + turn @ point
 
-    centers = torch.stack([place(body, center) for body, center in skeleton.centers.items()], dim=-2)
+    centers = torch.stack([place(body, skeleton.centers[body]) for body in frames], dim=-2)
     feet = torch.stack([place(body, center) for body, center in skeleton.feet], dim=-2)
     return centers, feet, torch.stack(axes, dim=-2), torch.stack(anchors, dim=-2)
 

@@ -48,7 +48,6 @@ _HEADED, _OF_JOINTS, _OF_BODY = (("heading", "invariant"), ("joint", "invariant"
 class HumanoidWalker2d(FreeStates):
     """B walkers, states (B, 15); action: angles of left hip, left knee, right hip, right knee (B, 4), clipped to ±1."""
 
-    action_size = 4
     abstract_state = column(
         ABSTRACT_STATE,
         [
@@ -123,7 +122,6 @@ _JOINTS = [
 class HumanoidKinematics(FreeStates):
     """B humanoids' joints, (B, 34); action: angles of left hip and knee, right hip and knee, (B, 4), clipped to ±1."""
 
-    action_size = 4
     abstract_state = column(ABSTRACT_STATE, _JOINTS, "angles and rates of all joints")
     abstraction = staticmethod(humanoid.humanoid_to_kinematics)
 
@@ -247,8 +245,7 @@ class PlanarWalking(Walking):
 
     def missed(self, state: Tensor, goal: Tensor) -> Tensor:
         """Return which torsos of states (B, 15) are outside of the healthy heights, (B,) bool."""
-        low, high = self.locomotion.healthy_m
-        return ~((state[:, 0] > low) & (state[:, 0] < high))
+        return torch.as_tensor(~self.locomotion.healthy(state[:, 0]))
 
     def velocity(self, before: Tensor, after: Tensor) -> Tensor:
         """Return the forward velocity of the center of mass after the step, with stiff arms, (B,) in m/s."""

@@ -11,8 +11,7 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.lazy import Tensor, torch
 from astra_data.worlds.geometry import turned
 from astra_data.worlds.plane.mazes import Maze
-from astra_data.worlds.plane.navigation import PlanarObjective
-from astra_data.worlds.plane.point_mass import PlanarStates
+from astra_data.worlds.plane.navigation import PlanarObjective, PlanarStates
 
 ROLLING_M_S2 = 0.30  # deceleration of the ball of RoboCup's Standard Platform League (B-Human's ballSpecification)
 BALL_RADIUS_M = 0.05  # of the same ball
@@ -78,7 +77,6 @@ class BallAgent(PlanarStates):
     """
 
     state_size = 8
-    action_size = 3
 
     def __init__(
         self,
@@ -139,7 +137,7 @@ class BallAgent(PlanarStates):
         ball, velocity = before[:, 4:6], before[:, 6:]
         speed = moved[:, 6:].norm(dim=-1, keepdim=True)
         lay = velocity.norm(dim=-1, keepdim=True) <= _LIES_M_S
-        turn_rad = _TURN_RAD * torch.randn(self.num_envs, device=ball.device)
+        turn_rad = _TURN_RAD * torch.randn(len(ball), device=ball.device)
         direction = torch.nn.functional.normalize(torch.where(lay, turned(own, turn_rad), velocity))
         slowed_m_s = self._deceleration_m_s2 * self.period_s
         leaving = (speed + slowed_m_s).clamp_min(_LEAVES_M_S * lay)
@@ -148,7 +146,7 @@ class BallAgent(PlanarStates):
         needed, evidence = self.memory.split(1, dim=-1)
         evidence = _FADES * evidence + touched * speed / _SEEN_M_S
         rolls = torch.where(lay, touched & (evidence > needed), self._rolls & (speed > _LIES_M_S))
-        undecided = self._undecided(self.num_envs)
+        undecided = self._undecided(len(ball))
         self.memory = torch.where(rolls, undecided, torch.cat([needed, evidence], dim=-1))
         still = torch.cat([ball, torch.zeros_like(ball)], dim=-1)
         self.reset_to(torch.cat([moved[:, :4], torch.where(rolls, rolled, still)], dim=-1))

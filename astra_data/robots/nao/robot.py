@@ -49,17 +49,11 @@ class BatchedBodies(BatchedPhysics):
     """B bodies of one model; one that has fallen stays as it is until its reset."""
 
     def __init__(
-        self,
-        model: "mujoco.MjModel",
-        traits: walk.Traits,
-        *,
-        longest_delay_ticks: int,
-        style: walk.WalkStyle,
-        num_threads: int,
+        self, model: "mujoco.MjModel", traits: walk.Traits, *, longest_delay_ticks: int, num_threads: int
     ) -> None:
         count = len(traits.stiffness)
         super().__init__(model, count, substeps=SUBSTEPS, num_threads=num_threads)
-        self.traits, self.style = traits, style
+        self.traits = traits
         self._stiffness = float(model.actuator_gainprm[0, 0])
         self.sent: Floats = np.zeros((count, longest_delay_ticks + TICKS, MOTORS))
         self.tilting: Floats = np.zeros((count, 2))
@@ -108,7 +102,7 @@ class BatchedBodies(BatchedPhysics):
     def _walk(
         self, model: "mujoco.MjModel", data: "mujoco.MjData", row: int, targets: walk.Targets, noise: Floats
     ) -> int:
-        style, sent, rates, step = self.style, self.sent[row], data.qvel[3:6], mujoco.mj_step
+        style, sent, rates, step = walk.STYLE, self.sent[row], data.qvel[3:6], mujoco.mj_step
         planned = (targets.angles[row] + self.traits.joint_offset_rad[row])[:, walk.TO_MOTORS]
         supports, lifts_off = targets.supports[row].tolist(), targets.lifts_off[row].tolist()
         first = sent.shape[0] - TICKS
@@ -171,17 +165,14 @@ class BatchedNao:
         self.num_robots = num_robots
         self.spread = spread or walk.TraitSpread()
         self.has_ball = ball
-        self._limits, style = walk.WalkLimits(), walk.WalkStyle()
-        self._seed, self._steps = seed, 0
+        self.reseed(seed)
         rng = np.random.default_rng(seed)
         self.traits = walk.Traits.draw(self.spread, num_robots, rng)
-        self.gait = walk.Gait.standing(num_robots, self._limits)
-        self._engine = walk.WalkEngine(self.traits.quality, self._limits, style)
+        self.gait = walk.Gait.standing(num_robots)
         self.bodies = BatchedBodies(
             nao_model(maze, ball=ball),
             self.traits,
             longest_delay_ticks=self.spread.delay_ticks[1],
-            style=style,
             num_threads=num_threads or cores(),
         )
         self.reset(np.arange(num_robots), np.zeros((num_robots, 3)), rng)
@@ -189,13 +180,13 @@ class BatchedNao:
     def reset(self, rows: NDArray[np.intp], pose: Floats, rng: np.random.Generator, ball: Floats | None = None) -> None:
         """Set robots upright at `pose` (n, 3), with new traits, and balls at `ball` (n, 2), by default 1 m ahead."""
         walk.put_rows(self.traits, rows, walk.Traits.draw(self.spread, len(rows), rng))
-        standing = walk.Gait.standing(len(rows), self._limits)
+        standing = walk.Gait.standing(len(rows))
         walk.put_rows(self.gait, rows, standing)
-        angles = walk.leg_angles(self._engine.feet(standing))
+        angles = walk.leg_angles(walk.stance(standing))
         x, y, yaw = pose.T
         qpos = np.tile(self.bodies.model.qpos0, (len(rows), 1))
         qpos[:, 0], qpos[:, 1] = x, y
-        qpos[:, 2] = self._engine.style.hip_height_m + walk.HIP_OFFSET_Z_M
+        qpos[:, 2] = walk.STYLE.hip_height_m + walk.HIP_OFFSET_Z_M
         qpos[:, 3], qpos[:, 6] = np.cos(yaw / 2), np.sin(yaw / 2)
         qpos[:, 7:_BALL] = angles[:, walk.TO_MOTORS]
         if self.has_ball:
@@ -208,16 +199,16 @@ class BatchedNao:
         """Walk for 0.192 s at `command` (B, 3), m/s ahead and left, rad/s; who is to `kick` does in its next swing."""
         upright = ~self.bodies.fallen
         rows = np.flatnonzero(upright if active is None else active & upright)
-        targets = self._engine.advance(replace(self.gait), command, TICKS, self._kicking_feet(kick))
-        noise = np.random.default_rng([self._seed, self._steps]).normal(
-            0.0, self.spread.gyro_noise_rad_s, (self.num_robots, TICKS, 3)
-        )
-        self._steps += 1
+        kicking = self._kicking_feet(kick)
+        targets = walk.advance(replace(self.gait), command, self.traits.quality, TICKS, kicking)
+        rng, size = np.random.default_rng(self._noise.tolist()), (self.num_robots, TICKS, 3)
+        noise = rng.normal(0.0, self.spread.gyro_noise_rad_s, size)
+        self._noise[1] += 1
         self.gait = targets.reached(self.bodies.advance(rows, targets, noise))
 
     def reseed(self, seed: int) -> None:
         """Restart the noise of the sensors at `seed`."""
-        self._seed, self._steps = seed, 0
+        self._noise = np.array([seed, 0])  # and the number of steps so far
 
     def _kicking_feet(self, kick: Bools | None) -> Bools:
         if kick is None or not self.has_ball:
@@ -262,19 +253,9 @@ class BatchedNao:
         up = rotation_matrix(self.bodies.qpos[:, 3:7])[:, 2]
         return np.stack([np.arctan2(up[:, 1], up[:, 2]), np.arcsin(np.clip(-up[:, 0], -1.0, 1.0))], axis=1)
 
-    def state_dict(self) -> dict[str, Any]:
-        """Return copies of what `load_state_dict` needs to continue exactly from here."""
-        noise = {"seed": self._seed, "steps": self._steps}
-        return {name: value.copy() for name, value in self._arrays().items()} | noise
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from `state` of robots that were built with the same arguments."""
-        for name, value in self._arrays().items():
-            value[:] = state[name]
-        self._seed, self._steps = int(state["seed"]), int(state["steps"])
-
-    def _arrays(self) -> dict[str, NDArray[Any]]:
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return the arrays that later steps depend on, themselves."""
         bodies = self.bodies
         parts = ("state", "sent", "held", "waited", "tilting", "gyro", "pressure", "fallen", "touching")
         own = {name: getattr(bodies, name) for name in parts}
-        return own | vars(self.gait) | vars(self.traits)
+        return {**own, **vars(self.gait), **vars(self.traits), "noise": self._noise}

@@ -16,8 +16,7 @@ from astra_data.robots.nao.robot import CONTROL_STEP_S, BatchedNao
 from astra_data.robots.nao.walk import JOINTS, TICK_S
 from astra_data.worlds.geometry import wrapped
 from astra_data.worlds.plane.mazes import FIELD, S_MAZE
-from astra_data.worlds.plane.navigation import Navigation, PlanarObjective, PlanarTarget
-from astra_data.worlds.plane.point_mass import PointMass, VariedPlanar
+from astra_data.worlds.plane.navigation import Navigation, PlanarObjective, PlanarTarget, PointMass, VariedPlanar
 from astra_data.worlds.protocols import Step, rows_in
 from astra_data.worlds.task import PLANAR_GOAL, PLANAR_STATE, ColumnEntry, Task, Varied, column, entries
 from astra_data.worlds.variation import RANDOMIZED_ACTIONS, WIDE_RANGES, BallVariation
@@ -180,13 +179,12 @@ class NaoEnv(PlanarTarget):
         seed: int,
         ball: bool = False,
         start_anywhere: bool = False,
-        errors: PerceptionErrors | None = None,
+        errors: PerceptionErrors = PerceptionErrors(),
         num_threads: int | None = None,
     ) -> None:
         super().__init__(objective, num_envs, start_anywhere=start_anywhere)
         self.has_ball, self.action_size = ball, objective.action_size
         self.robots = BatchedNao(num_envs, seed=seed, maze=objective.maze, ball=ball, num_threads=num_threads)
-        errors = errors or PerceptionErrors()
         self.localisation = Localisation(num_envs, errors, CONTROL_STEP_S)
         self.sight = BallSight(num_envs, errors, CONTROL_STEP_S)
         self.observation_size = STATE_SIZE + BALL_SIZE * ball + 2
@@ -291,18 +289,19 @@ class NaoEnv(PlanarTarget):
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return what `load_state_dict` needs to continue from here."""
-        arrays = {**self.robots.state_dict(), **self.localisation.arrays(), **self.sight.arrays()}
-        tensors = {name: torch.from_numpy(np.array(value)) for name, value in arrays.items()}
+        tensors = {name: torch.from_numpy(values.copy()) for name, values in self._arrays().items()}
         drawn = json.dumps(self._rng.bit_generator.state).encode()
         return tensors | {"goal": self.goal.clone(), "drawn": torch.tensor(list(drawn), dtype=torch.uint8)}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Continue from `state`."""
-        self.robots.load_state_dict({name: values.numpy() for name, values in state.items()})
-        for name, values in (self.localisation.arrays() | self.sight.arrays()).items():
+        for name, values in self._arrays().items():
             values[:] = state[name].numpy()
         self.goal = state["goal"].clone()
         self._rng.bit_generator.state = json.loads(bytes(state["drawn"].tolist()))
+
+    def _arrays(self) -> dict[str, NDArray[Any]]:
+        return self.robots.arrays() | self.localisation.arrays() | self.sight.arrays()
 
 
 _RADIUS_M = 0.1  # radius of the mass at walls in the simulators: as in AntMaze, and less than the robot's 0.14 m

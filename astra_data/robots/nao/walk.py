@@ -4,7 +4,7 @@ Poses of feet are those of soles in the torso's frame: x, y, z in m, roll, pitch
 it takes the mean of what each foot needs; the other joints keep the soles' positions and planes exact.
 """
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -150,6 +150,7 @@ class WalkLimits:
     sideways_stops_at_turn_rad: float = float(np.radians(45.4))
 
 
+LIMITS = WalkLimits()
 STRIDE, START, STOP = 0, 1, 2  # kinds of steps: the first and the last step of a walk only shift the weight
 
 
@@ -168,11 +169,11 @@ class Gait:
     kicking: Bools  # whether the swinging foot kicks, (B,)
 
     @classmethod
-    def standing(cls, count: int, limits: WalkLimits) -> "Gait":
+    def standing(cls, count: int) -> "Gait":
         """Return `count` standing robots, whose first step is the left foot's."""
         return cls(
             phase=np.zeros(count),
-            duration_s=np.full(count, limits.step_s),
+            duration_s=np.full(count, LIMITS.step_s),
             left_swings=np.zeros(count, dtype=bool),
             walking=np.zeros(count, dtype=bool),
             kind=np.full(count, STOP),
@@ -207,6 +208,9 @@ class WalkStyle:
     kick_reach_m: float = 0.08  # distance that a kicking foot swings beyond its step
 
 
+STYLE = WalkStyle()
+
+
 @dataclass(frozen=True)
 class Targets:
     """Targets of the legs for the next ticks."""
@@ -218,126 +222,116 @@ class Targets:
 
     def reached(self, ticks: NDArray[np.intp]) -> Gait:
         """Return the gait of robots that followed `ticks` (B,) of them."""
-        parts = {
-            part.name: np.stack([getattr(gait, part.name) for gait in self.gaits])[ticks, np.arange(len(ticks))]
-            for part in fields(Gait)
-        }
-        return Gait(**parts)
+        rows, gaits = np.arange(len(ticks)), [vars(gait) for gait in self.gaits]
+        return Gait(**{name: np.stack([gait[name] for gait in gaits])[ticks, rows] for name in gaits[0]})
 
 
-@dataclass(frozen=True)
-class WalkEngine:
-    """Walks B robots."""
+def attainable(command: Floats, quality: Floats) -> Floats:
+    """Return `command` (B, 3), m/s, m/s, rad/s, reduced to what robots of a `quality` (B,) can walk, see `Traits`."""
+    x, y, turn = command.T
+    turn = np.clip(turn, -LIMITS.turn_rad_s * quality, LIMITS.turn_rad_s * quality)
+    per_step = 2 * turn * LIMITS.step_s * LIMITS.wide_turn
+    top_x = np.where(x > 0, LIMITS.forward_m_s, LIMITS.backward_m_s) * quality
+    top_y = LIMITS.sideways_m_s * quality
+    top_x = top_x * np.clip(1 - (per_step / LIMITS.forward_stops_at_turn_rad) ** 2, 0, 1)
+    top_y = top_y * np.clip(1 - (per_step / LIMITS.sideways_stops_at_turn_rad) ** 2, 0, 1)
+    x, y = np.clip(x, -top_x, top_x), np.clip(y, -top_y, top_y)
+    share_x = np.divide(x, top_x, out=np.zeros_like(x), where=top_x > 0)
+    share_y = np.divide(y, top_y, out=np.zeros_like(y), where=top_y > 0)
+    excess = np.maximum(np.hypot(share_x, share_y), 1.0)
+    x, y = x / excess, y / excess
+    return np.stack([x, y, turn], axis=1)
 
-    quality: Floats  # factor on a robot's top speeds, (B,): 1 new, 0.83 worn (B-Human's two sets of limits)
-    limits: WalkLimits
-    style: WalkStyle
 
-    def attainable(self, command: Floats) -> Floats:
-        """Return `command` (B, 3), m/s, m/s, rad/s, reduced to velocities that can be walked, (B, 3)."""
-        limits, quality = self.limits, self.quality
-        x, y, turn = command.T
-        turn = np.clip(turn, -limits.turn_rad_s * quality, limits.turn_rad_s * quality)
-        per_step = 2 * turn * limits.step_s * limits.wide_turn
-        top_x = np.where(x > 0, limits.forward_m_s, limits.backward_m_s) * quality
-        top_y = limits.sideways_m_s * quality
-        top_x = top_x * np.clip(1 - (per_step / limits.forward_stops_at_turn_rad) ** 2, 0, 1)
-        top_y = top_y * np.clip(1 - (per_step / limits.sideways_stops_at_turn_rad) ** 2, 0, 1)
-        x, y = np.clip(x, -top_x, top_x), np.clip(y, -top_y, top_y)
-        share_x = np.divide(x, top_x, out=np.zeros_like(x), where=top_x > 0)
-        share_y = np.divide(y, top_y, out=np.zeros_like(y), where=top_y > 0)
-        excess = np.maximum(np.hypot(share_x, share_y), 1.0)
-        x, y = x / excess, y / excess
-        return np.stack([x, y, turn], axis=1)
+def tick(gait: Gait, command: Floats, quality: Floats, on_the_spot: Bools) -> Bools:
+    """Advance `gait`, planning steps by `command` (B, 3), none for zero but `on_the_spot`; return who began one."""
+    gait.phase = np.where(gait.walking, gait.phase + TICK_S / gait.duration_s, 0.0)
+    called = (command != 0).any(axis=1) | on_the_spot
+    landed = gait.walking & (gait.phase >= 1)
+    rests = landed & ~called & (gait.kind == STOP)
+    begins = (landed & ~rests) | (~gait.walking & called)
+    if landed.any() or begins.any():
+        _plan(gait, attainable(command, quality), called, begins)
+        gait.phase = np.where(landed, gait.phase - 1, gait.phase) * ~rests
+        gait.walking = (gait.walking & ~rests) | begins
+    return np.asarray(begins)
 
-    def tick(self, gait: Gait, command: Floats, on_the_spot: Bools) -> Bools:
-        """Advance `gait`, planning steps by `command` (B, 3), none for zero but `on_the_spot`; return who began one."""
-        gait.phase = np.where(gait.walking, gait.phase + TICK_S / gait.duration_s, 0.0)
-        called = (command != 0).any(axis=1) | on_the_spot
-        landed = gait.walking & (gait.phase >= 1)
-        rests = landed & ~called & (gait.kind == STOP)
-        begins = (landed & ~rests) | (~gait.walking & called)
-        if landed.any() or begins.any():
-            self._plan(gait, command, called, begins)
-            gait.phase = np.where(landed, gait.phase - 1, gait.phase) * ~rests
-            gait.walking = (gait.walking & ~rests) | begins
-        return np.asarray(begins)
 
-    def _plan(self, gait: Gait, command: Floats, called: Bools, begins: Bools) -> None:
-        limits = self.limits
-        x, y, turn = self.attainable(command).T
-        x = _nearer_zero_or_up_to(gait.forward_m_s, x, limits.slow_down_m_s, limits.speed_up_m_s)
-        closed = (gait.after == 0).all(axis=1)
-        kind = np.where(gait.kind == STOP, START, np.where(closed & ~called, STOP, STRIDE))
-        # The first stride is that of the foot on the side that the command leads to.
-        sideways = np.where(y != 0, y, turn)
-        left_swings = np.where((kind == START) & (sideways != 0), sideways < 0, ~gait.left_swings)
-        leads_y, leads_turn = left_swings == (y > 0), left_swings == (turn > 0)
-        duration = limits.step_s + limits.step_s_per_sideways_m_s * np.abs(y)
-        turn_share = np.where(leads_turn, limits.wide_turn, 1 - limits.wide_turn)
-        after = np.stack([x * duration, 2 * y * duration * leads_y, 2 * turn * duration * turn_share], axis=1)
-        after *= (kind == STRIDE)[:, None]
-        gait.before = np.where(begins[:, None], gait.after, gait.before)
-        gait.after = np.where(begins[:, None], after, gait.after)
-        gait.left_swings = np.where(begins, left_swings, gait.left_swings)
-        gait.kind = np.where(begins, kind, gait.kind)
-        gait.duration_s = np.where(begins, duration, gait.duration_s)
-        gait.forward_m_s = np.where(begins, x * (kind == STRIDE), gait.forward_m_s)
+def _plan(gait: Gait, velocity: Floats, called: Bools, begins: Bools) -> None:
+    x, y, turn = velocity.T
+    x = _nearer_zero_or_up_to(gait.forward_m_s, x, LIMITS.slow_down_m_s, LIMITS.speed_up_m_s)
+    closed = (gait.after == 0).all(axis=1)
+    kind = np.where(gait.kind == STOP, START, np.where(closed & ~called, STOP, STRIDE))
+    # The first stride is that of the foot on the side that the command leads to.
+    sideways = np.where(y != 0, y, turn)
+    left_swings = np.where((kind == START) & (sideways != 0), sideways < 0, ~gait.left_swings)
+    leads_y, leads_turn = left_swings == (y > 0), left_swings == (turn > 0)
+    duration = LIMITS.step_s + LIMITS.step_s_per_sideways_m_s * np.abs(y)
+    turn_share = np.where(leads_turn, LIMITS.wide_turn, 1 - LIMITS.wide_turn)
+    after = np.stack([x * duration, 2 * y * duration * leads_y, 2 * turn * duration * turn_share], axis=1)
+    after *= (kind == STRIDE)[:, None]
+    gait.before = np.where(begins[:, None], gait.after, gait.before)
+    gait.after = np.where(begins[:, None], after, gait.after)
+    gait.left_swings = np.where(begins, left_swings, gait.left_swings)
+    gait.kind = np.where(begins, kind, gait.kind)
+    gait.duration_s = np.where(begins, duration, gait.duration_s)
+    gait.forward_m_s = np.where(begins, x * (kind == STRIDE), gait.forward_m_s)
 
-    def advance(self, gait: Gait, command: Floats, ticks: int, kick: Bools) -> Targets:
-        """Walk on at `command` (B, 3) for `ticks`, changing `gait`; feet that are to `kick` (B, 2) do in a swing."""
-        feet, supports, lifts_off, gaits = [], [], [], [replace(gait)]
-        steps_on = np.asarray(kick.any(axis=1))
-        for _ in range(ticks):
-            begins = self.tick(gait, command, steps_on)
-            kicks = np.where(gait.left_swings, kick[:, 0], kick[:, 1])
-            gait.kicking = np.where(begins, kicks & (gait.kind == STRIDE), gait.kicking)
-            feet.append(self.feet(gait))
-            supports.append(gait.walking[:, None] & np.stack([~gait.left_swings, gait.left_swings], axis=1))
-            lifts_off.append((begins & (gait.kind == STRIDE)) * np.where(gait.left_swings, 1, -1))
-            gaits.append(replace(gait))
-        return Targets(
-            leg_angles(np.stack(feet, axis=1)), np.stack(supports, axis=1), np.stack(lifts_off, axis=1), gaits
-        )
 
-    def feet(self, gait: Gait) -> Floats:
-        """Return the present target poses of the feet in the torso's frame, (B, 2, 6), see `leg_angles`."""
-        style, phase = self.style, gait.phase[:, None]
-        scale = np.array(style.step_scale) / 2
-        behind, ahead = -gait.before * scale, gait.after * scale
-        swung = (1 - np.cos(np.pi * phase)) / 2
-        swinging = behind + (ahead - behind) * swung
-        swinging[:, 0] += gait.kicking * style.kick_reach_m * np.sin(np.pi * gait.phase) ** 2
-        supporting = -behind - (ahead - behind) * phase
-        offset = np.stack([supporting, swinging], axis=1)
-        offset = np.where(gait.left_swings[:, None, None], offset[:, ::-1], offset)
+def advance(gait: Gait, command: Floats, quality: Floats, ticks: int, kick: Bools) -> Targets:
+    """Walk on at `command` (B, 3) for `ticks`, changing `gait`; feet that are to `kick` (B, 2) do in a swing."""
+    feet, supports, lifts_off, gaits = [], [], [], [replace(gait)]
+    steps_on = np.asarray(kick.any(axis=1))
+    for _ in range(ticks):
+        begins = tick(gait, command, quality, steps_on)
+        kicks = np.where(gait.left_swings, kick[:, 0], kick[:, 1])
+        gait.kicking = np.where(begins, kicks & (gait.kind == STRIDE), gait.kicking)
+        feet.append(stance(gait))
+        supports.append(gait.walking[:, None] & np.stack([~gait.left_swings, gait.left_swings], axis=1))
+        lifts_off.append((begins & (gait.kind == STRIDE)) * np.where(gait.left_swings, 1, -1))
+        gaits.append(replace(gait))
+    return Targets(leg_angles(np.stack(feet, axis=1)), np.stack(supports, axis=1), np.stack(lifts_off, axis=1), gaits)
 
-        yaw, apart = offset[..., 2], np.array([HIP_OFFSET_Y_M, -HIP_OFFSET_Y_M])
-        x, y = offset[..., 0], offset[..., 1] + apart
-        pose = np.zeros((*yaw.shape, 6))
-        pose[..., 0] = np.cos(yaw) * x - np.sin(yaw) * y - style.torso_ahead_m
-        pose[..., 1] = np.sin(yaw) * x + np.cos(yaw) * y - self._sway(gait)[:, None]
-        pose[..., 2] = -style.hip_height_m - HIP_OFFSET_Z_M
-        lifted = gait.walking & (gait.kind == STRIDE)
-        in_air = np.where(gait.left_swings, 0, 1)
-        pose[np.arange(len(pose)), in_air, 2] += lifted * style.lift_m * np.sin(np.pi * gait.phase)
-        pose[..., 5] = yaw
-        return pose
 
-    def _sway(self, gait: Gait) -> Floats:
-        """Return the torso's sway to the left, (B,) in m: an inverted pendulum on the supporting foot."""
-        rate = np.sqrt(GRAVITY / self.style.pendulum_m)
-        done, left = gait.phase * gait.duration_s, (1 - gait.phase) * gait.duration_s
-        foot = np.where(gait.left_swings, -1.0, 1.0) * self.style.sway_foot_m
-        half = self.style.step_scale[1] / 2
-        begin, end = foot + half * gait.before[:, 1], foot - half * gait.after[:, 1]
-        straight = begin * (1 - gait.phase) + end * gait.phase
-        swing = (begin * np.sinh(rate * left) + end * np.sinh(rate * done)) / np.sinh(rate * gait.duration_s)
-        # In the first and the last step, from rest to the stride's speed and back.
-        throw = foot * rate * np.tanh(rate * gait.duration_s / 2) * gait.duration_s
-        rest = throw * gait.phase * (1 - gait.phase)
-        shift = rest * np.where(gait.kind == START, gait.phase, 1 - gait.phase)
-        return np.asarray(gait.walking * np.where(gait.kind == STRIDE, straight - swing, shift))
+def stance(gait: Gait) -> Floats:
+    """Return the present target poses of the feet in the torso's frame, (B, 2, 6), see `leg_angles`."""
+    phase = gait.phase[:, None]
+    scale = np.array(STYLE.step_scale) / 2
+    behind, ahead = -gait.before * scale, gait.after * scale
+    swung = (1 - np.cos(np.pi * phase)) / 2
+    swinging = behind + (ahead - behind) * swung
+    swinging[:, 0] += gait.kicking * STYLE.kick_reach_m * np.sin(np.pi * gait.phase) ** 2
+    supporting = -behind - (ahead - behind) * phase
+    offset = np.stack([supporting, swinging], axis=1)
+    offset = np.where(gait.left_swings[:, None, None], offset[:, ::-1], offset)
+
+    yaw, apart = offset[..., 2], np.array([HIP_OFFSET_Y_M, -HIP_OFFSET_Y_M])
+    x, y = offset[..., 0], offset[..., 1] + apart
+    pose = np.zeros((*yaw.shape, 6))
+    pose[..., 0] = np.cos(yaw) * x - np.sin(yaw) * y - STYLE.torso_ahead_m
+    pose[..., 1] = np.sin(yaw) * x + np.cos(yaw) * y - sway(gait)[:, None]
+    pose[..., 2] = -STYLE.hip_height_m - HIP_OFFSET_Z_M
+    lifted = gait.walking & (gait.kind == STRIDE)
+    in_air = np.where(gait.left_swings, 0, 1)
+    pose[np.arange(len(pose)), in_air, 2] += lifted * STYLE.lift_m * np.sin(np.pi * gait.phase)
+    pose[..., 5] = yaw
+    return pose
+
+
+def sway(gait: Gait) -> Floats:
+    """Return the torso's sway to the left, (B,) in m: an inverted pendulum on the supporting foot."""
+    rate = np.sqrt(GRAVITY / STYLE.pendulum_m)
+    done, left = gait.phase * gait.duration_s, (1 - gait.phase) * gait.duration_s
+    foot = np.where(gait.left_swings, -1.0, 1.0) * STYLE.sway_foot_m
+    half = STYLE.step_scale[1] / 2
+    begin, end = foot + half * gait.before[:, 1], foot - half * gait.after[:, 1]
+    straight = begin * (1 - gait.phase) + end * gait.phase
+    swing = (begin * np.sinh(rate * left) + end * np.sinh(rate * done)) / np.sinh(rate * gait.duration_s)
+    # In the first and the last step, from rest to the stride's speed and back.
+    throw = foot * rate * np.tanh(rate * gait.duration_s / 2) * gait.duration_s
+    rest = throw * gait.phase * (1 - gait.phase)
+    shift = rest * np.where(gait.kind == START, gait.phase, 1 - gait.phase)
+    return np.asarray(gait.walking * np.where(gait.kind == STRIDE, straight - swing, shift))
 
 
 def _nearer_zero_or_up_to(speed: Floats, wanted: Floats, loss: float, gain: float) -> Floats:

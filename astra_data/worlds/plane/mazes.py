@@ -131,24 +131,17 @@ _EDGE_M = 1e-4  # distance from the face of a blocked cell at which a sliding po
 
 
 class FreeSpace:
-    """The cells in which the center of a disc may be: not those of `blocked` (height, width)."""
+    """The cells of a maze in which the center of a disc may be, to the nearest cell of the grid: not `blocked` ones."""
 
-    def __init__(self, blocked: Tensor, half_extent: Tensor, cell_m: float) -> None:
-        self.blocked, self.half_extent, self.cell_m = blocked, half_extent, cell_m
-        depth = torch.from_numpy(scipy.ndimage.distance_transform_edt(blocked.cpu().numpy()))
-        # Distance of blocked cells from the nearest free one, in cells; 0 in free ones.
-        self._depth = depth.float().to(blocked.device)
-        self._limits = torch.tensor(blocked.shape[::-1], device=blocked.device) - 1
-
-    @classmethod
-    @lru_cache(maxsize=16)  # for who builds simulators often
-    def of_maze(cls, maze: Maze, *, radius_m: float, device: str = "cpu") -> "FreeSpace":
-        """Return the free space of a disc of `radius_m`, to the nearest cell of the grid."""
+    def __init__(self, maze: Maze, *, radius_m: float, device: str = "cpu") -> None:
         reach = round(radius_m / maze.fine_m)
         square = np.ones((2 * reach + 1, 2 * reach + 1), dtype=bool)
         blocked = scipy.ndimage.binary_dilation(maze.fine_walls, square, border_value=1)
-        half_extent = torch.tensor(maze.half_extent, dtype=torch.float32, device=device)
-        return cls(torch.from_numpy(blocked).to(device), half_extent, maze.fine_m)
+        self.blocked, self.cell_m = torch.from_numpy(blocked).to(device), maze.fine_m
+        self.half_extent = torch.tensor(maze.half_extent, dtype=torch.float32, device=device)
+        # Distance of blocked cells from the nearest free one, in cells; 0 in free ones.
+        self._depth = torch.from_numpy(scipy.ndimage.distance_transform_edt(blocked)).float().to(device)
+        self._limits = torch.tensor(blocked.shape[::-1], device=device) - 1
 
     def slide(self, start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
         """Move points from `start` to `end` (B, 2), each axis up to blocked cells; return where, and who stopped."""
@@ -172,6 +165,9 @@ class FreeSpace:
         return torch.minimum(cells.clamp_min(0), self._limits)
 
 
+free_space = lru_cache(maxsize=16)(FreeSpace)  # for who builds simulators often
+
+
 @dataclass(frozen=True)
 class GoalDistance:
     """Length of the shortest free path to a goal near the maze's goal cell: a field for each point of a lattice."""
@@ -182,19 +178,18 @@ class GoalDistance:
     cell_m: float  # side of a field's cell
 
     @classmethod
-    def of_maze(cls, maze: Maze, *, spacing_m: float, radius_m: float = 0.0) -> "GoalDistance":
+    @lru_cache(maxsize=16)  # they take seconds, and are too large to move to an accelerator in every step
+    def of_maze(cls, maze: Maze, *, spacing_m: float, radius_m: float = 0.0, device: str = "cpu") -> "GoalDistance":
         """Compute a disc's fields for 7 x 7 goals, `spacing_m` apart, around the goal cell's middle."""
+        if device != "cpu":
+            here = cls.of_maze(maze, spacing_m=spacing_m, radius_m=radius_m)
+            return cls(here.fields.to(device), here.lattice.to(device), here.half_extent.to(device), here.cell_m)
         steps = np.arange(-3, 4) * spacing_m
         center = np.array(maze.cell_center(*maze.goal))
         lattice = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2) + center
         fields = np.stack([maze.distance_field(goal, radius=radius_m) for goal in lattice])
         half_extent = torch.tensor(maze.half_extent, dtype=torch.float32)
         return cls(torch.from_numpy(fields).float(), torch.from_numpy(lattice).float(), half_extent, maze.fine_m)
-
-    def to(self, device: "str | torch.device") -> "GoalDistance":
-        """Return the same fields on `device`."""
-        tensors = (self.fields.to(device), self.lattice.to(device), self.half_extent.to(device))
-        return GoalDistance(*tensors, self.cell_m)
 
     def __call__(self, position: Tensor, goal: Tensor) -> Tensor:
         """Return the distance in m (..., B), bilinear, from `position` (..., B, 2) to `goal` (B, 2)."""

@@ -70,7 +70,7 @@ def test_the_agreement_is_that_of_held_out_episodes_alone(paired: Path, grounded
     for row, length in enumerate(held_out.lengths.tolist()):
         steps = slice(row, row + 1), slice(0, length)
         history = [windows.goal[steps], windows.previous_action[steps]]
-        source, _ = model.encoder(model.encoder_input(windows.state[steps], *history))
+        source, _ = model.encoder.sequence(model.encoder_input(windows.state[steps], *history))
         target, _ = encoder.encoder.sequence(encoder.encoder_input(held_out.target_state[steps], *history))
         latents.append(source[0])
         squares.append((target - source).square().flatten())

@@ -23,7 +23,7 @@ from astra_data.pipeline.stages.ground import ground
 from astra_data.pipeline.stages.train import train
 from astra_data.policies.networks import ActorCritic, PolicyShape, SoftActor, Student
 from astra_data.policies.running_policy import PolicyFile
-from astra_data.policies.simulator_env import Simulation, WorldConfig, command_limit, plus
+from astra_data.policies.simulator_env import CHANGE_PENALTY, Simulation, WorldConfig, command_limit
 from astra_data.policies.train import PpoTrainConfig, SacTrainConfig, Training
 from astra_data.robots.registry import TASKS
 
@@ -85,8 +85,10 @@ def test_after_an_interruption_it_goes_on(
     resumed = make(task, method, paired, grounding, out, progress=lambda done, note: seen.append(done))
     assert seen == pytest.approx([5 / 6, 1.0]) and resumed == expected
     policy = PolicyFile.load(out / "policy.safetensors")
-    plain, limit = WorldConfig(data_start_share=0.5), command_limit(TASKS[task], PairedEpisodes.load(paired))
-    assert policy.simulation == Simulation(plus(plain, limit) if method == "astra_plus" else plain)
+    limit = command_limit(TASKS[task], PairedEpisodes.load(paired))
+    plus = {"reward": "priced", "change_penalty": CHANGE_PENALTY, "command_limit": limit}
+    world = WorldConfig(data_start_share=0.5).model_copy(update=plus if method == "astra_plus" else {})
+    assert policy.simulation == Simulation(world)
 
 
 def test_sac_trains_a_soft_actor(task: str, paired: Path, grounded: Path, tmp_path: Path) -> None:

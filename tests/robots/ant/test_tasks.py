@@ -168,7 +168,7 @@ def placed(positions: list[list[float]], **options: float) -> tasks.AntMazeEnv:
     """Stand ants at `positions`, with the goal far away."""
     env = tasks.AntMazeEnv(TASK, len(positions), seed=0, num_threads=1, **options)  # type: ignore[arg-type]
     env.reset()
-    state = np.concatenate([tasks.standing_pose(len(positions)), np.zeros((len(positions), 14))], axis=1)
+    state = np.tile(tasks.STANDING, (len(positions), 1))
     state[:, :2] = positions
     env.reset_to(np.arange(len(positions)), state)
     return env

@@ -7,7 +7,7 @@ import torch
 from astra_data.core.errors import BadInputError
 from astra_data.robots.nao import kicking
 from astra_data.worlds.plane.mazes import FIELD
-from astra_data.worlds.plane.point_mass import VariedPlanar
+from astra_data.worlds.plane.navigation import VariedPlanar
 from astra_data.worlds.variation import BallVariation
 
 
@@ -153,9 +153,9 @@ def test_a_correction_says_how_likely_a_ball_that_lies_is_hit(before_m_s: float,
 
 def kicked(simulator: kicking.BallAgent, speed_m_s: float) -> torch.Tensor:
     """Kick balls that lie, and correct them to `speed_m_s`; return which roll (B,)."""
-    start = START.expand(simulator.num_envs, 8)
+    start = START.expand(len(simulator.state), 8)
     simulator.reset_to(start)
-    simulator.step(torch.tensor([[0.0, 0.0, 1.0]]).expand(simulator.num_envs, 3))
+    simulator.step(torch.tensor([[0.0, 0.0, 1.0]]).expand(len(simulator.state), 3))
     landed = start.clone()
     landed[:, 6] = speed_m_s
     return simulator.settle(start, landed)[:, 6:].any(dim=-1)

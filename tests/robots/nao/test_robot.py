@@ -63,18 +63,20 @@ def test_shanks_and_feet_touch_the_ball_and_the_chest_does_not(part: str) -> Non
     assert (part in touched) == (part != "chest")
 
 
-STYLE = legs.WalkStyle(gyro_gain=(0.0, 0.0))
-STANDING = legs.leg_angles(
-    legs.WalkEngine(np.ones(1), legs.WalkLimits(), STYLE).feet(legs.Gait.standing(1, legs.WalkLimits()))
-)[0]
+STYLE = replace(legs.STYLE, gyro_gain=(0.0, 0.0))
+STANDING = legs.leg_angles(legs.stance(legs.Gait.standing(1)))[0]
 FIRST = 3  # the longest delay: so many angles are under way when a control step begins
 
 
-def bodies(
-    count: int = 1, *, height_m: float = 0.0, style: legs.WalkStyle = STYLE, **traits: NDArray[Any]
-) -> BatchedBodies:
+@pytest.fixture
+def stiff(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let no ankle push against what the gyroscope measures."""
+    monkeypatch.setattr(legs, "STYLE", STYLE)
+
+
+def bodies(count: int = 1, *, height_m: float = 0.0, **traits: NDArray[Any]) -> BatchedBodies:
     drawn = replace(legs.Traits.draw(IDENTICAL, count, np.random.default_rng(0)), **traits)
-    made = BatchedBodies(nao_model(), drawn, longest_delay_ticks=FIRST, style=style, num_threads=1)
+    made = BatchedBodies(nao_model(), drawn, longest_delay_ticks=FIRST, num_threads=1)
     qpos = np.tile(made.model.qpos0, (count, 1))
     qpos[:, 2] = STYLE.hip_height_m + legs.HIP_OFFSET_Z_M + height_m
     qpos[:, 7 : 7 + MOTORS] = STANDING[legs.TO_MOTORS]
@@ -97,6 +99,7 @@ def noise(count: int = 1) -> Floats:
     return np.zeros((count, TICKS, 3))
 
 
+@pytest.mark.usefixtures("stiff")
 def test_angles_arrive_after_their_delay() -> None:
     robots = bodies(3, delay_ticks=np.array([0, 2, 3]))
     followed = robots.advance(np.arange(3), targets(3), noise(3))
@@ -114,6 +117,7 @@ def test_angles_arrive_after_their_delay() -> None:
     np.testing.assert_allclose(robots.sent[:, :FIRST], np.tile(expected[-FIRST:], (3, 1, 1)))
 
 
+@pytest.mark.usefixtures("stiff")
 def test_one_control_step_is_mujocos_own_with_each_robots_floor_and_servos() -> None:
     robots = bodies(2, friction=np.array([0.3, 0.7]), stiffness=np.array([0.8, 1.0]), height_m=0.02)
     before = robots.qpos.copy()
@@ -134,10 +138,10 @@ def test_one_control_step_is_mujocos_own_with_each_robots_floor_and_servos() -> 
         np.testing.assert_allclose(robots.pressure[row], data.sensordata, atol=1e-6)
 
 
-def test_the_ankles_that_carry_push_against_the_measured_rates() -> None:
+def test_the_ankles_that_carry_push_against_the_measured_rates(monkeypatch: pytest.MonkeyPatch) -> None:
     """In the air nothing turns the torso; what the gyroscope measures there is its noise alone."""
-    style = replace(STYLE, gyro_gain=(0.1, 0.2), gyro_keep=0.5)
-    robots = bodies(height_m=1.0, style=style, delay_ticks=np.array([0]))
+    monkeypatch.setattr(legs, "STYLE", replace(STYLE, gyro_gain=(0.1, 0.2), gyro_keep=0.5))
+    robots = bodies(height_m=1.0, delay_ticks=np.array([0]))
     measured = noise()
     measured[0, 0] = [0.4, 0.8, 0.0]  # roll and pitch rate in the first tick only
     robots.advance(np.array([0]), targets(carries=(True, False)), measured)
@@ -149,6 +153,7 @@ def test_the_ankles_that_carry_push_against_the_measured_rates() -> None:
     assert not added[:, [10, 11]].any() and not np.delete(added, [4, 5, 10, 11], axis=1).any()
 
 
+@pytest.mark.usefixtures("stiff")
 @pytest.mark.parametrize(
     ("lifts_off", "lean_deg", "waits"), [(1, -5, True), (1, 5, False), (-1, 5, True), (-1, -5, False), (0, -5, False)]
 )
@@ -162,6 +167,7 @@ def test_a_foot_that_the_torso_leans_over_waits_to_be_lifted(lifts_off: int, lea
     assert (followed[0] < TICKS) == waits
 
 
+@pytest.mark.usefixtures("stiff")
 @pytest.mark.parametrize("axis", [0, 1])
 @pytest.mark.parametrize(("degrees", "fallen"), [(44.5, False), (-44.5, False), (46.5, True), (-46.5, True)])
 def test_a_robot_that_leans_by_over_45_degrees_any_way_has_fallen(axis: int, degrees: float, fallen: bool) -> None:

@@ -55,13 +55,13 @@ def test_each_trait_has_its_own_range() -> None:
     assert np.unique(traits.delay_ticks).tolist() == [1, 2, 3, 4]
 
 
-LIMITS = walk.WalkLimits()
-NOBODY = np.zeros(1, bool)
+NEW, NOBODY = np.ones(1), np.zeros(1, bool)
 STYLE = walk.WalkStyle(step_scale=(1.0, 1.0, 1.0))
 
 
-def engine(quality: float = 1.0) -> walk.WalkEngine:
-    return walk.WalkEngine(np.array([quality]), LIMITS, STYLE)
+@pytest.fixture(autouse=True)
+def plain_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(walk, "STYLE", STYLE)
 
 
 def one(*command: float) -> Floats:
@@ -70,10 +70,10 @@ def one(*command: float) -> Floats:
 
 def strides(command: Floats, seconds: float, gait: walk.Gait | None = None) -> list[walk.Gait]:
     """Return the gait at the begin of each stride."""
-    gait = gait or walk.Gait.standing(1, LIMITS)
+    gait = gait or walk.Gait.standing(1)
     seen = []
     for _ in range(round(seconds / walk.TICK_S)):
-        begins = engine().tick(gait, command, NOBODY)
+        begins = walk.tick(gait, command, NEW, NOBODY)
         if begins[0] and gait.kind[0] == walk.STRIDE:
             seen.append(walk.Gait(**{name: value.copy() for name, value in vars(gait).items()}))
     return seen
@@ -97,8 +97,8 @@ def strides(command: Floats, seconds: float, gait: walk.Gait | None = None) -> l
     ],
 )
 def test_attainable_speeds(command: tuple[float, ...], attained: tuple[float, ...]) -> None:
-    np.testing.assert_allclose(engine().attainable(one(*command)), [attained], atol=1e-12)
-    worn = engine(0.5).attainable(np.array([[0.9, 0, 0], [0, -0.9, 0], [0, 0, -9.0]]))
+    np.testing.assert_allclose(walk.attainable(one(*command), NEW), [attained], atol=1e-12)
+    worn = walk.attainable(np.array([[0.9, 0, 0], [0, -0.9, 0], [0, 0, -9.0]]), np.array([0.5]))
     np.testing.assert_allclose(worn, np.diag([0.125, -0.1, -np.radians(60)]), atol=1e-12)
 
 
@@ -131,10 +131,10 @@ def test_a_turn_is_split_between_wide_and_narrow_steps() -> None:
 
 
 def test_walking_begins_and_ends_with_a_shift_of_weight() -> None:
-    gait, kinds = walk.Gait.standing(1, LIMITS), []
+    gait, kinds = walk.Gait.standing(1), []
     for tick in range(200):
         command = one(0.1, 0, 0) if tick < 100 else one(0, 0, 0)
-        if engine().tick(gait, command, NOBODY)[0]:
+        if walk.tick(gait, command, NEW, NOBODY)[0]:
             kinds.append(int(gait.kind[0]))
     assert kinds[0] == walk.START and kinds[-1] == walk.STOP and set(kinds[1:-1]) == {walk.STRIDE}
     assert not gait.walking[0] and (gait.after == 0).all()
@@ -142,7 +142,7 @@ def test_walking_begins_and_ends_with_a_shift_of_weight() -> None:
 
 def striding(**changes: object) -> walk.Gait:
     """Return a robot amid a stride of its left foot, straight on by 4 cm from step to step."""
-    gait = walk.Gait.standing(1, LIMITS)
+    gait = walk.Gait.standing(1)
     gait.walking[:], gait.kind[:], gait.left_swings[:] = True, walk.STRIDE, True
     gait.before[:], gait.after[:] = [[0.04, 0.0, 0.0]], [[0.04, 0.0, 0.0]]
     for name, value in changes.items():
@@ -151,7 +151,7 @@ def striding(**changes: object) -> walk.Gait:
 
 
 def feet_at(phase: float, **changes: object) -> Floats:
-    return np.asarray(engine().feet(striding(phase=phase, **changes))[0])
+    return np.asarray(walk.stance(striding(phase=phase, **changes))[0])
 
 
 def test_the_supporting_foot_moves_back_evenly_and_the_swinging_one_comes_forward() -> None:
@@ -168,7 +168,7 @@ def test_the_supporting_foot_moves_back_evenly_and_the_swinging_one_comes_forwar
 
 def test_the_torso_sways_as_a_pendulum_on_the_supporting_foot() -> None:
     rate = np.sqrt(walk.GRAVITY / STYLE.pendulum_m)
-    duration, dt = LIMITS.step_s, 1e-3
+    duration, dt = walk.LIMITS.step_s, 1e-3
     phases = (np.array([-1, 0, 1])[:, None] * dt + np.linspace(0.1, 0.9, 9) * duration) / duration
 
     def torso(phase: float) -> float:
@@ -183,7 +183,7 @@ def test_the_torso_sways_as_a_pendulum_on_the_supporting_foot() -> None:
     np.testing.assert_allclose(acceleration, rate**2 * (sway[1] + STYLE.sway_foot_m), rtol=1e-3)
     # In steps aside that foot moves evenly, by half a step to either end.
     aside = {"before": [0.0, 0.02, 0.0], "after": [0.0, 0.03, 0.0]}
-    sway = np.array([[engine()._sway(striding(phase=phase, **aside))[0] for phase in row] for row in phases])
+    sway = np.array([[walk.sway(striding(phase=phase, **aside))[0] for phase in row] for row in phases])
     foot = -STYLE.sway_foot_m + 0.01 * (1 - phases[1]) - 0.015 * phases[1]
     acceleration = (sway[0] - 2 * sway[1] + sway[2]) / dt**2
     np.testing.assert_allclose(acceleration, rate**2 * (sway[1] - foot), rtol=1e-3)
@@ -191,14 +191,12 @@ def test_the_torso_sways_as_a_pendulum_on_the_supporting_foot() -> None:
 
 def test_targets_are_the_angles_of_the_planned_feet_tick_by_tick() -> None:
     command = one(0.2, 0.0, 0.0)
-    walking, again = walk.Gait.standing(1, LIMITS), walk.Gait.standing(1, LIMITS)
-    targets = engine().advance(walking, command, 40, np.zeros((1, 2), bool))
+    walking, again = walk.Gait.standing(1), walk.Gait.standing(1)
+    targets = walk.advance(walking, command, NEW, 40, np.zeros((1, 2), bool))
     assert targets.angles.shape == (1, 40, 11) and len(targets.gaits) == 41
     for tick in range(40):
-        engine().tick(again, command, NOBODY)
-        np.testing.assert_allclose(
-            foot_poses(targets.angles[0, tick])[:, :5], engine().feet(again)[0][:, :5], atol=1e-9
-        )
+        walk.tick(again, command, NEW, NOBODY)
+        np.testing.assert_allclose(foot_poses(targets.angles[0, tick])[:, :5], walk.stance(again)[0][:, :5], atol=1e-9)
         assert targets.supports[0, tick].tolist() == [not again.left_swings[0], bool(again.left_swings[0])]
     reached = targets.reached(np.array([17]))
     for name, value in vars(targets.gaits[17]).items():
@@ -208,9 +206,9 @@ def test_targets_are_the_angles_of_the_planned_feet_tick_by_tick() -> None:
 
 def test_a_kick_waits_for_the_foot_that_is_asked_for_and_keeps_the_robot_stepping() -> None:
     for asked, swings_left in (([True, False], True), ([False, True], False)):
-        gait = walk.Gait.standing(1, LIMITS)
-        targets = engine().advance(gait, np.zeros((1, 3)), 120, np.array([asked]))
+        gait = walk.Gait.standing(1)
+        targets = walk.advance(gait, np.zeros((1, 3)), NEW, 120, np.array([asked]))
         kicking = {(bool(gait.left_swings[0]), int(gait.kind[0])) for gait in targets.gaits if gait.kicking[0]}
         assert kicking == {(swings_left, walk.STRIDE)}
-    still = engine().advance(walk.Gait.standing(1, LIMITS), np.zeros((1, 3)), 120, np.array([[False, False]]))
+    still = walk.advance(walk.Gait.standing(1), np.zeros((1, 3)), NEW, 120, np.array([[False, False]]))
     assert not any(gait.walking[0] for gait in still.gaits)

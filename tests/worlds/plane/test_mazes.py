@@ -80,7 +80,7 @@ ROOM = Maze(rows=("111", "101", "111"), scale=4.0, start=(1, 1), goal=(1, 1))
 
 
 def slide(maze: Maze, start: list[float], end: list[float]) -> tuple[list[float], bool]:
-    rest, stopped = FreeSpace.of_maze(maze, radius_m=0.1).slide(torch.tensor([start]), torch.tensor([end]))
+    rest, stopped = FreeSpace(maze, radius_m=0.1).slide(torch.tensor([start]), torch.tensor([end]))
     return rest[0].tolist(), bool(stopped[0])
 
 
@@ -98,7 +98,7 @@ def test_walls_stop_each_axis_by_itself(end: list[float], rest: list[float]) -> 
     start = [float(np.clip(value, -1.85, 1.85)) for value in end]
     reached, stopped = slide(ROOM, start, end)
     assert reached == pytest.approx(rest, abs=2e-4) and stopped
-    free = FreeSpace.of_maze(ROOM, radius_m=0.1)
+    free = FreeSpace(ROOM, radius_m=0.1)
     column, row = free.cells(torch.tensor(reached))
     assert not free.blocked[row, column]
 
@@ -106,7 +106,7 @@ def test_walls_stop_each_axis_by_itself(end: list[float], rest: list[float]) -> 
 @pytest.mark.parametrize(("fine_m", "radius_m"), [(0.1, 0.3), (0.1, 0.6), (0.05, 0.35), (0.25, 0.75)])
 def test_a_disc_keeps_its_whole_radius_from_walls(fine_m: float, radius_m: float) -> None:
     """Also where a radius is a hair less than its number of cells, as 0.3 / 0.1 is."""
-    free = FreeSpace.of_maze(replace(ROOM, fine_m=fine_m), radius_m=radius_m)
+    free = FreeSpace(replace(ROOM, fine_m=fine_m), radius_m=radius_m)
     inside, outside = 2.0 - radius_m - fine_m / 2, 2.0 - radius_m + fine_m / 2
     points = torch.tensor([[inside, 0.0], [0.0, -inside], [outside, 0.0], [0.0, -outside]])
     column, row = free.cells(points).unbind(-1)
