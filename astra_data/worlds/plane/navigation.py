@@ -192,6 +192,11 @@ class PlanarStates(FreeStates):
                 f"radius_m: expected a multiple of the maze's fine_m, {maze.fine_m} m, got {radius_m}: "
                 "take another radius, or a finer maze"
             )
+        if (way_m := timestep_s * speed_m_s) > maze.scale / 2:
+            raise BadInputError(
+                f"speed_m_s: expected steps of {maze.scale / 2:g} m, half a cell of the maze, or shorter, got "
+                f"{way_m:g} m: longer ones pass through walls"
+            )
         self.parameters = {"timestep_s": timestep_s, "radius_m": radius_m, "speed_m_s": speed_m_s}
         self.free = free_space(maze, radius_m=radius_m, device=device)
         self._maze = maze

@@ -194,6 +194,12 @@ def test_a_radius_between_the_cells_of_the_maze_is_refused(fine_m: float, radius
         PlanarStates(replace(U_MAZE, fine_m=fine_m), 1, timestep_s=0.1, radius_m=radius_m)
 
 
+def test_steps_that_pass_through_walls_are_refused() -> None:
+    assert PointMass(U_MAZE, 1, timestep_s=0.5, speed_m_s=4.0).parameters["speed_m_s"] == 4.0
+    with pytest.raises(BadInputError, match=r"speed_m_s: expected steps of 2 m, half a cell of the maze, .* 2\.05 m"):
+        PointMass(U_MAZE, 1, timestep_s=0.5, speed_m_s=4.1)
+
+
 def test_corrections_keep_as_clear_of_walls_as_they_are_told_and_steps_do_not() -> None:
     """The wall's face is at 6 m; the disc's center comes as close as 0.1 m."""
     states = planar(3, 5)
