@@ -72,8 +72,15 @@ class Rows:
                 found[names.REWARD] = found[names.REWARD].astype(np.float64)
                 found[names.REWARD][-1] += stored[names.REWARD][-1]
         found |= flags
-        with np.errstate(over="ignore", invalid="ignore"):
-            return {spec.name: found[spec.name].astype(spec.dtype) for spec in specs}
+        return {spec.name: cast(spec.name, found[spec.name], spec.dtype) for spec in specs}
+
+
+def cast(name: str, values: Array, dtype: str) -> Array:
+    """Return `values` in a type of ours; floats that are too large for it become infinite."""
+    if values.dtype == np.uint64 and dtype == "int64" and (values >= 2**63).any():
+        raise BadInputError(f"{name}: expected whole numbers below 2^63")
+    with np.errstate(over="ignore", invalid="ignore"):
+        return values.astype(dtype)
 
 
 def ends_with(flag: str, run: plain.Run) -> bool:

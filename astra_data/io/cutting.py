@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from astra_data.core.arrays import Bools, Floats, Ints, as_column, as_rows
+from astra_data.core.arrays import Bools, Floats, as_column, as_rows
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import first_few
 from astra_data.dataset import columns as keys
@@ -205,7 +205,11 @@ class Cutter:
         masks["gap"] = np.asarray((steps_s[:, 1:] > (self.mapping.split.gap_s or np.inf)).any(axis=1))
         masks["rejected"] = table["/torn"] | (~table["/finite"] & (self.mapping.not_finite == "split"))
         jumps = np.zeros(n, bool)
-        jumps[kept] = self._jumped(table, kept)
+        if jump := self.mapping.split.jump:
+            [column] = (column for column in self.columns if column.name == jump.column)
+            where = as_rows(table[jump.column])[np.ix_(kept, np.array(jump.values))].astype(np.float64)
+            moved = shortest(np.diff(where, axis=0, prepend=where[:1]), full_turns(column)[list(jump.values)])
+            jumps[kept] = np.linalg.norm(moved, axis=1) > jump.above
         self._count_time(table, steps_s, masks["field"] | masks["end"] | masks["gap"] | jumps)
         if not len(kept):
             return
@@ -242,15 +246,6 @@ class Cutter:
             values = {column.name: table[column.name][part] for column in self.columns if column.name in table}
             source = {"source": self._parts[table["/part"][part[0]]].origin}
             yield from self._episode(values, source | {"source_row": int(table["/row"][part[0]])})
-
-    def _jumped(self, table: Table, kept: Ints) -> Bools:
-        jump = self.mapping.split.jump
-        if not jump:
-            return np.zeros(len(kept), bool)
-        [column] = (column for column in self.columns if column.name == jump.column)
-        where = as_rows(table[jump.column])[np.ix_(kept, np.array(jump.values))].astype(np.float64)
-        steps = shortest(np.diff(where, axis=0, prepend=where[:1]), full_turns(column)[list(jump.values)])
-        return np.asarray(np.linalg.norm(steps, axis=1) > jump.above)
 
     def _place(self, table: Table, at: int) -> str:
         return str(self._parts[table["/part"][at]].row_name(int(table["/row"][at])))

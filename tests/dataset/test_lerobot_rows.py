@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from astra_data.core.errors import CorruptDatasetError
+from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.dataset import columns as names
 from astra_data.dataset.columns import STATE, Array, Column
 from astra_data.dataset.format import DEFAULT_COLUMNS
@@ -116,6 +116,11 @@ def test_a_success_of_the_row_that_is_left_out_is_lost_unless_the_episode_is_ove
     assert found_in(run, rows, {}, row=0, uid=9).lost_reward == STEPS - 1
     rows, run = rows_and_run({names.REWARD: np.ones(STEPS), names.NEXT_STATE: np.ones((STEPS, 2))})
     assert found_in(run, rows, {}, row=0, uid=9).lost_reward == 0.0
+
+
+def test_whole_numbers_that_int64_does_not_hold_are_refused() -> None:
+    with pytest.raises(BadInputError, match=r"count: expected whole numbers below 2\^63"):
+        values("count", "int64", more={"count": np.full(STEPS, 2**63, np.uint64)})
 
 
 WHOLE = "expected a whole number of frames per second"

@@ -151,8 +151,7 @@ class Remains:
         """Return the columns of an episode; the writer refuses what is too large for its type."""
         if self.rows:
             return self.rows.values(self.specs, run, 0, 0, uid)
-        with np.errstate(over="ignore"):
-            return {spec.name: run.columns[spec.name].astype(spec.dtype, copy=False) for spec in self.specs}
+        return {spec.name: lerobot.cast(spec.name, run.columns[spec.name], spec.dtype) for spec in self.specs}
 
     def losses(self, episodes: int, content_hash: str) -> Iterator[str]:
         """Say what is not among the episodes saved, and whether their values are those written."""

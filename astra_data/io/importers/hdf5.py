@@ -30,8 +30,15 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
 def _blocks(
     source: Source, mapping: ImportMapping, origin: str, datasets: dict[str, Any], attributes: dict[str, Any]
 ) -> Iterator[Block]:
-    if mapping.episodes is None:
-        _refuse_groups(datasets, mapping, origin)
+    stored, wanted = datasets.keys(), mapping.all_fields
+    groups = {name.removesuffix(f"/{field}") for field in wanted for name in stored} - stored
+    whole = [group for group in groups if all(f"{group}/{field}" in stored for field in wanted)]
+    if mapping.episodes is None and whole and not stored & set(wanted):
+        pattern = re.sub("[0-9]+", "*", first := min(whole, key=natural))
+        raise BadInputError(
+            f"{origin}: the fields are in {len(whole)} groups, such as {first}: give the mapping episodes = "
+            f'"{pattern}", and each is an episode'
+        )
     order = slice(None, None, -1 if mapping.transposed else 1)
     shapes = {name: (dataset.shape or ())[order] for name, dataset in datasets.items()}
     single = {name: datasets[name] for name, shape in shapes.items() if not shape} | attributes
@@ -118,19 +125,6 @@ def _labels(demo: dict[str, Any], fields: list[str]) -> list[str]:
         for field, width in widths.items()
         for number in range(width)
     ]
-
-
-def _refuse_groups(stored: dict[str, Any], mapping: ImportMapping, origin: str) -> None:
-    """Raise BadInputError where the fields are not in the file itself, but all in each of some groups."""
-    groups = {name.removesuffix(f"/{field}") for field in mapping.all_fields for name in stored} - {*stored}
-    whole = [group for group in groups if all(f"{group}/{field}" in stored for field in mapping.all_fields)]
-    if whole and not stored.keys() & set(mapping.all_fields):
-        first = min(whole, key=natural)
-        pattern = re.sub("[0-9]+", "*", first)
-        raise BadInputError(
-            f"{origin}: the fields are in {len(whole)} groups, such as {first}: give the mapping episodes = "
-            f'"{pattern}", and each is an episode'
-        )
 
 
 def _episodes(file: Any, pattern: str | None, origin: str) -> Iterator[tuple[str, dict[str, Any], dict[str, Any]]]:
