@@ -169,7 +169,8 @@ class Experiment:
             own = {name: {**table, "method": None} for name, table in own.items() if name in makers}
             asked = {*STAGES} - {"select", "report"} | {table.name for table in tables_of if table}
             tables = {name: table for name, table in settings.items() if name in asked}
-            return {"data": data if data and is_address(data) else None} | tables | own
+            task, data = Path(str(settings.get("task"))).name, data if data and is_address(data) else None
+            return {"task": task, "data": data} | tables | own
 
         before, now = (dict[str, Any](of) for of in (found.settings, self.recipe.settings))
         old, new = ({*((of.get("sweep") or {}).get("percent") or [None])} for of in (before, now))

@@ -481,3 +481,6 @@ def test_a_report_is_added_to_what_is_published_beside_the_recipe(
         recipe.write_text(text + f"[{table}]\n{key} = 7\n")
         with pytest.raises(RecipeError, match=rf"^{table} \({key}: {before}, now 7\) changed .* since the results"):
             run_stage(recipe, "report", root=tmp_path, publish=True)
+    recipe.write_text(text.replace("umaze", "long"))
+    with pytest.raises(RecipeError, match=r'^task \("antmaze-umaze", now "antmaze-long"\) changed in the recipe in'):
+        load_experiment(recipe, tmp_path).published()

@@ -86,7 +86,11 @@ class Relocation:
                 continue
             ends = [positions(self.task, episode.columns[name][steps]) for name in (names.STATE, names.NEXT_STATE)]
             path = turn.positions(np.concatenate(ends).astype(np.float64))
-            shifts = self._draw_shifts(ends[0][0], path, rng)
+            shifts = np.asarray(ends[0][0] - path[0])[None]
+            if self.translations:  # those that keep the path inside the maze, where it fits
+                room = self.task.maze.half_extent
+                low, high = -room - path.min(axis=0), room - path.max(axis=0)
+                shifts = rng.uniform(low, np.maximum(low, high), (_SHIFTS, 2))
             # Rounded to float32, as datasets store them.
             fits = self._is_free((path + shifts[:, None]).astype(np.float32)).all(axis=1)
             if fits.any():
@@ -115,14 +119,6 @@ class Relocation:
 
     def _is_free(self, points: Array) -> Array:
         return self.task.maze.clearance(points) > self.margin_m
-
-    def _draw_shifts(self, start: Array, path: Array, rng: np.random.Generator) -> Array:
-        """Draw shifts (n, 2) that keep `path` (T, 2) inside the maze where it fits."""
-        if not self.translations:
-            return np.asarray(start - path[0])[None]
-        room = self.task.maze.half_extent
-        low, high = -room - path.min(axis=0), room - path.max(axis=0)
-        return rng.uniform(low, np.maximum(low, high), (_SHIFTS, 2))
 
 
 def outcomes(objective: Objective, before: Array, after: Array, goal: Array, toppled: Array) -> dict[str, Array]:

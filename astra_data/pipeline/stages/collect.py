@@ -206,7 +206,10 @@ def suboptimal_by_sac(
     running = RunningPolicy(task, actor, observed="full")
 
     def judge(figures: Mapping[str, float]) -> tuple[float, str]:
-        lasted = _lasts(running, derive(seed, f"trial {sac.steps}"), num_threads)
+        # Tested episodes last longer than those of the training.
+        trial = derive(seed, f"trial {sac.steps}")
+        begin, starts = (lambda goal: begin_drawing(running, len(goal), trial)), derive(trial, "starts")
+        lasted = fmean(in_target(task, begin, _TEST_EPISODES, starts, num_threads=num_threads).steps)
         return max(sac.steps / steps, lasted / episode_steps), f"episodes last {lasted:.0f} steps"
 
     return _trained(sac, world, judge, folder, progress, "full")
@@ -235,17 +238,6 @@ def _trained(
     spent = logbook.stopwatch.spent()
     metadata = {"trained_steps": learner.steps, "learner": settings, "spent": spent}
     return PolicyFile(policy, None, None, None, observed), metadata
-
-
-def _lasts(running: RunningPolicy, seed: int, num_threads: int | None) -> float:
-    """Return how many steps episodes of the policy last on average: more than those of its training."""
-    starts = derive(seed, "starts")
-
-    def begin(goal: Tensor) -> Act:
-        return begin_drawing(running, len(goal), seed)
-
-    tested = in_target(running.task, begin, _TEST_EPISODES, starts, num_threads=num_threads)
-    return fmean(tested.steps)
 
 
 class CollectConfig(Config):

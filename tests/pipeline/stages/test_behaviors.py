@@ -203,11 +203,11 @@ def test_sac_stops_once_episodes_last_or_after_its_steps(
 ) -> None:
     seeds: list[int] = []
 
-    def lasts(deployed: Any, seed: int, num_threads: int | None) -> float:
+    def lasts(task: Task, begin: object, episodes: int, seed: int, **_: object) -> Any:
         seeds.append(seed)
-        return float(lasting[len(seeds) - 1])
+        return SimpleNamespace(steps=[lasting[len(seeds) - 1]] * episodes)
 
-    monkeypatch.setattr(suboptimal, "_lasts", lasts)
+    monkeypatch.setattr(suboptimal, "in_target", lasts)
     shares: list[float] = []
     policy, metadata = suboptimal_by_sac(
         WALKER,
@@ -219,7 +219,8 @@ def test_sac_stops_once_episodes_last_or_after_its_steps(
         progress=lambda share, note: shares.append(share),
     )
     assert metadata["trained_steps"] == trained and shares[0] == pytest.approx(max(100 / steps, 10 / 50))
-    assert shares[-1] == 1.0 and seeds == [derive(3, f"trial {100 * (count + 1)}") for count in range(len(seeds))]
+    trials = (derive(3, f"trial {100 * (count + 1)}") for count in range(len(seeds)))
+    assert shares[-1] == 1.0 and seeds == [derive(trial, "starts") for trial in trials]
     assert type(policy.policy) is SoftActor and policy.observed == "full"
     config = Counting.made[0].config
     assert isinstance(config, SacConfig) and (config.total_steps, config.discount) == (steps, 0.99)
