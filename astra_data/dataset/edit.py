@@ -31,7 +31,6 @@ _IMPORTED = (
 _COMPARED = {"<=": le, ">=": ge, "==": eq, "!=": ne, "<": lt, ">": gt}
 _NUMBER = r"true|false|[+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?"
 _CONDITION = re.compile(rf"\s*(.+?)\s*(<=|>=|==|!=|<|>)\s*({_NUMBER})\s*", re.IGNORECASE | re.ASCII)
-_OBSERVED = re.compile(r"(next\.)?observation\.")
 _FINEST = 100  # times the recorded rate
 type _Turns = dict[int, float]  # full turns of the angles in a column, by their index
 
@@ -321,15 +320,14 @@ def _resampled(episode: Episode, turns: Sequence[tuple[Column, _Turns]], before:
     columns: dict[str, Array] = {}
     for column, angles in turns:
         values, is_next = episode.columns[column.name], column.name.startswith("next.")
+        is_observed = column.name.removeprefix("next.").startswith("observation.") and column.name != names.GOAL
         if column.name == names.REWARD:
             sums = np.concatenate([[0.0], np.cumsum(values, dtype=np.float64)])
             found = np.diff(sums[[*row[:-1], len(episode)]])
         elif column.name in (names.TERMINATED, names.TRUNCATED, names.DONE, names.SUCCESS):
             counts = np.concatenate([[0], np.cumsum(values)])
             found = np.diff(counts[[*row[:-1], len(episode)]]) > 0
-        elif is_clock(column) or (
-            column.dtype == "float32" and _OBSERVED.match(column.name) and column.name != names.GOAL
-        ):
+        elif is_clock(column) or (column.dtype == "float32" and is_observed):
             of = episode.columns[names.STATE] if column.name == names.NEXT_STATE else values
             if has_next and column.name in (names.STATE, names.NEXT_STATE):
                 of = np.concatenate([of, episode.columns[names.NEXT_STATE][-1:]])

@@ -80,6 +80,8 @@ def test_what_is_there_already_is_left_alone(fake: Dataset, shared: Path, tmp_pa
     for out in (tmp_path / "other", tmp_path / "named", plain, tmp_path, tmp_path / "file"):
         with pytest.raises(BadInputError, match="exists already and holds something else"):
             pull(source(shared), out=out)
+    with pytest.raises(DiskError, match="set cannot be written: a file is where a folder has to be"):
+        pull(source(shared), out=tmp_path / "file" / "set")
 
 
 def test_a_copy_that_was_altered_is_told(fake: Dataset, shared: Path, tmp_path: Path) -> None:
