@@ -1,6 +1,8 @@
 """How tests try random examples: ASTRA_DATA_FUZZ is how many of each kind; by default few, always the same."""
 
 import os
+from collections.abc import Iterator
+from typing import Any
 
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
@@ -26,3 +28,11 @@ def broken(content: bytes, changes: list[Edit]) -> bytes:
         place = int(share * len(content))
         content = content[:place] + new + (b"" if is_cut else content[place + len(new) :])
     return content
+
+
+def places(value: object, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """Yield the path of everything inside `value`, outer ones first."""
+    if path:
+        yield path
+    for key in value if isinstance(value, dict) else range(len(value)) if isinstance(value, list) else ():
+        yield from places(value[key], (*path, key))  # type: ignore[index]

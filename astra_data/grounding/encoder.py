@@ -11,7 +11,7 @@ from torch.autograd.function import FunctionCtx
 from torch.nn import functional
 
 from astra_data.core.errors import BadInputError
-from astra_data.worlds.user_code import explained
+from astra_data.worlds.user_code import expect, explained
 
 _LONGEST_M = 16.0  # longest wavelength of position features
 _LEAST = 1e-3  # lower bound of a deviation
@@ -104,6 +104,7 @@ def check_encoder(encoder: Encoder, inputs: Tensor) -> None:
     encoder.eval()
     with explained(f"{name}, on inputs of shape {tuple(inputs.shape)},"):
         latents, memories = encoder.sequence(inputs)
+        expect(f"{name}.sequence: latents", latents, (*inputs.shape[:2], encoder.latent_size))
         memory = encoder.initial(len(inputs))
         for step, given in enumerate(inputs.unbind(1)):
             memory = encoder.step(given, memory)

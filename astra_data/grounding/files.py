@@ -101,8 +101,10 @@ def fitted(returned: object) -> tuple[FittedGrounding, dict[str, Any]]:
 def check_step(task: Task, fit: FittedGrounding, written: FittedGrounding, episodes: PairedEpisodes) -> None:
     """Run the simulator of `task`, as corrected by what was `fit` and `written`, from where `episodes` begin."""
     first, second = (_Tried(task, grounding, episodes.windows).whole() for grounding in (fit, written))
-    lost = f"{type(fit).__name__}.from_file: steps of what it returns end up to {{}} from those of what fit returned"
-    _expect_same(first, second, f"{lost}: expected what to_file wrote")
+    encoded = fit.encoder
+    file = f"{type(fit).__name__}.from_file" if encoded is None else f"{type(encoded.encoder).__name__}.state_dict"
+    lost = f"{file}: read again, steps end up to {{}} from those of what fit returned: expected all that they depend on"
+    _expect_same(first, second, f"{lost} in the file")
 
 
 class _Tried:

@@ -144,7 +144,8 @@ class HistoryFit:
         rewards = recorded_rewards(windows)
         model.set_reward_scales(*map(training.steps, (rewards, windows.goes_on, windows.failed)))
         weights = LossWeights(config.latent_weight * self.latent, config.reward_weight * self.reward)
-        return model, _optimize(model, weights, fitting)
+        metrics = _optimize(model, weights, fitting)
+        return model.eval(), metrics
 
     def _rewarded(self, task: Task, episodes: PairedEpisodes, predicts_failures: bool) -> PairedEpisodes:
         """Return the episodes with the rewards that R_pred learns."""
@@ -185,8 +186,10 @@ def _optimize(model: "GroundingModel", weights: "LossWeights", fitting: Fitting)
         model.update_target()
         if descent.done % _MEASURED_EVERY == 0 or descent.done == settings.updates:
             losses = {f"loss_{name}": float(value.detach()) for name, value in parts.items()}
+            model.eval()  # a user's encoder may have parts that only learning draws
             error = _held_out_error(model, fitting.held_out, weights)
             descent.keep(error, **losses, **telemetry(model, fitting.held_out, weights))
+            model.train()
         if descent.done % 10 == 0:
             note = f"{descent.done * config.batch_windows / descent.stopwatch.seconds:,.0f} windows/s"
             explained = descent.points[-1]["r2_state"] if descent.points else None

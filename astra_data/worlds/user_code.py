@@ -236,7 +236,7 @@ def parts_of(learned: object) -> tuple[Mapping[str, Tensor], dict[str, Any]]:
         kind = type(returned).__name__
         raise BadInputError(f"{what}: expected a pair, a dict of tensors and one of JSON values, got a {kind}")
     tensors, metadata = returned
-    faults = []
+    faults = [f"the name {name!r}, expected a text" for name in (*tensors, *metadata) if not isinstance(name, str)]
     for name, value in tensors.items():
         if not isinstance(value, torch.Tensor):
             kind = type(value).__name__

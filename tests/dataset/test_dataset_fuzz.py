@@ -14,10 +14,9 @@ import pyarrow.parquet as pq
 import pytest
 from damaged import DATA, EPISODES, declare
 from fake_dataset import write_fake
-from fuzzing import Edit, broken, edits, fuzzed, shares
+from fuzzing import Edit, broken, edits, fuzzed, places, shares
 from hypothesis import given
 from hypothesis import strategies as st
-from nested import places
 
 from astra_data.core.errors import AstraDataError
 from astra_data.dataset.doctor.check import check

@@ -43,7 +43,11 @@ def test_step_by_step_is_the_whole_sequence(kind: str) -> None:
     [
         (lambda latents, memories: (1.01 * latents, memories), "sequence: expected the latents of step, got .* step 0"),
         (lambda latents, memories: (latents, memories + 0.01), "sequence: expected the memories of step, got others"),
-        (lambda latents, memories: (latents[:, :, :9], memories), "sequence: expected the latents of step, got others"),
+        (
+            lambda latents, memories: (latents[:, :, :9], memories),
+            r"sequence: latents: expected shape .*, got \(3, 4, 9",
+        ),
+        (lambda latents, memories: (latents * torch.nan, memories), "sequence: latents: expected finite numbers"),
         (lambda latents, memories: latents, r"^HistoryEncoder, on inputs of shape \(3, 4, 5\), fails with V"),
     ],
 )

@@ -214,9 +214,7 @@ def test_a_simulator_that_a_training_would_not_run_as_it_is_meant_is_refused(
 def test_what_is_not_restored_as_it_was_or_not_finite_is_refused(tmp_path: Path) -> None:
     whole, lost = Shifted(torch.tensor([0.01])), Shifted(torch.tensor([0.0]))
     files.check_step(task_named(RAIL), whole, whole, windows_of(4))
-    with pytest.raises(
-        BadInputError, match=r"^Shifted\.from_file: steps of what it returns end up to 0\.05 from those"
-    ):
+    with pytest.raises(BadInputError, match=r"^Shifted\.from_file: read again, steps end up to 0\.05 from those"):
         files.check_step(task_named(RAIL), whole, lost, windows_of(4))
     with pytest.raises(BadInputError, match=r"^fit returned a Shifted with NaN or infinity in shift: expected finite"):
         files.save_grounding(tmp_path / "g", Shifted(torch.tensor([math.nan])), no_episodes())

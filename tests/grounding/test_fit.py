@@ -172,7 +172,7 @@ def test_it_returns_to_the_weights_with_the_least_held_out_error(
     seen, errors = list[dict[str, torch.Tensor]](), iter([2.0, 1.0, 3.0, 1.5, 4.0])
 
     def measured(model: GroundingModel, held_out: PairedEpisodes, weights: LossWeights) -> float:
-        assert weights == LossWeights(latent=0.2, reward=0.3)
+        assert not model.training and weights == LossWeights(latent=0.2, reward=0.3)
         seen.append({name: values.clone() for name, values in model.state_dict().items()})
         return next(errors)
 
@@ -182,6 +182,7 @@ def test_it_returns_to_the_weights_with_the_least_held_out_error(
     grounding, metrics, _ = fit(tmp_path, of, updates=5, latent_weight=0.2, reward_weight=0.3)
     assert metrics["updates"] == 2 and len(seen) == 4  # three tenths of five updates are awaited
     kept = grounding.model.state_dict()
+    assert not grounding.model.training
     assert all(torch.equal(kept[name], values) for name, values in seen[1].items())
     assert [point["held_out_error"] for point in metrics["epochs"]] == [2.0, 1.0, 3.0, 1.5]
 

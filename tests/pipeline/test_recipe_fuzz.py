@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fuzzing import fuzzed
+from fuzzing import fuzzed, places
 from hypothesis import given
 from hypothesis import strategies as st
-from nested import places
 
 from astra_data.core.config import validated
 from astra_data.core.errors import RecipeError

@@ -225,6 +225,7 @@ class Linear:
             "'mean' is a Tensor, expected a JSON value, or it among the tensors; 'at' is a list, .*",
         ),
         ({"w": torch.ones(1)}, "expected a pair, a dict of tensors and one of JSON values, got a dict"),
+        (({1: torch.ones(1)}, {2: 3}), "the name 1, expected a text; the name 2, expected a text"),
         (None, "expected a pair, .*, got a NoneType"),
         (({}, {}, {}), "expected a pair, .*, got a tuple"),
     ],

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from small_run import ALIGN
-from stopping import Stopped
+from stopping import Stopped, stop_past
 from toy_episodes import no_episodes
 
 from astra_data.core.durable import file_digest
@@ -130,10 +130,6 @@ def test_where_phi_drops_the_place_the_encoder_does_not_see_it(
     torch.testing.assert_close(scale[2:], load_target_encoder(aligned / "target_encoder.safetensors").state_std[2:])
 
 
-def stop(fraction: float, note: str) -> None:
-    raise Stopped
-
-
 def test_after_an_interruption_it_goes_on(paired: Path, grounded: Path, aligned: Path, tmp_path: Path) -> None:
     out = tmp_path / "interrupted"
 
@@ -141,7 +137,7 @@ def test_after_an_interruption_it_goes_on(paired: Path, grounded: Path, aligned:
         align(ALIGN, dataset=paired, grounding=grounded, out=out, progress=progress)
 
     with pytest.raises(Stopped):
-        begin(stop)
+        begin(stop_past(0.0))
     assert not out.exists()
     seen: list[float] = []
     begin(lambda done, note: seen.append(done))
