@@ -8,44 +8,28 @@ import pytest
 from fake_dataset import COLUMNS, DESCRIPTION, fake_columns, fake_episode, write_fake, writer
 
 from astra_data.core.errors import BadInputError
-from astra_data.dataset import Dataset, DatasetWriter
-from astra_data.dataset import versions as module
+from astra_data.dataset import Dataset, DatasetWriter, versions
 from astra_data.dataset.columns import ACTION, STATE, Column, Episode
 from astra_data.dataset.edit import filter_episodes, merge, subset
-from astra_data.dataset.versions import (
-    Differences,
-    Version,
-    column_faults,
-    differences,
-    home_of,
-    lineage,
-    locate,
-    names_apart,
-    names_at_home,
-    next_version,
-    open_dataset,
-    successor,
-    tree_lines,
-)
 
 
-def versions(*texts: str) -> list[Version]:
-    return [Version.parse(text) for text in texts]
+def parsed(*texts: str) -> list[versions.Version]:
+    return [versions.Version.parse(text) for text in texts]
 
 
 def test_versions_order_as_numbers() -> None:
-    assert sorted(versions("1.10.0", "1.9.3", "0.0.1")) == versions("0.0.1", "1.9.3", "1.10.0")
-    assert str(Version.parse("1.10.0")) == "1.10.0"
+    assert sorted(parsed("1.10.0", "1.9.3", "0.0.1")) == parsed("0.0.1", "1.9.3", "1.10.0")
+    assert str(versions.Version.parse("1.10.0")) == "1.10.0"
     for text in ("1.2", "9" * 5000 + ".0.0"):
         with pytest.raises(BadInputError, match="expected three numbers") as caught:
-            Version.parse(text)
+            versions.Version.parse(text)
         assert len(str(caught.value)) < 200
-    assert Version.from_tag("data-" + "9" * 5000 + ".0.0") is None
+    assert versions.Version.from_tag("data-" + "9" * 5000 + ".0.0") is None
 
 
 def test_the_next_version_is_free() -> None:
-    taken = versions("1.2.3", "1.4.0", "1.2.7", "3.9.0")
-    version = Version.parse("1.2.3")
+    taken = parsed("1.2.3", "1.4.0", "1.2.7", "3.9.0")
+    version = versions.Version.parse("1.2.3")
     assert str(version.next("columns", taken)) == "4.0.0" and str(version.next("episodes", taken)) == "1.5.0"
 
 
@@ -53,9 +37,9 @@ def test_a_dataset_is_found_by_folder_name_and_version(home: Path, tmp_path: Pat
     for version in ("1.2.0", "1.10.0"):
         (home / f"ant/data-{version}").mkdir(parents=True)
     (home / "ant/.data-2.0.0.tmp-1").mkdir()
-    assert locate("ant") == home / "ant/data-1.10.0"
-    assert locate("ant@data-1.2.0") == locate("ant@1.2.0") == home / "ant/data-1.2.0"
-    assert locate(str(tmp_path)) == tmp_path
+    assert versions.locate("ant") == home / "ant/data-1.10.0"
+    assert versions.locate("ant@data-1.2.0") == versions.locate("ant@1.2.0") == home / "ant/data-1.2.0"
+    assert versions.locate(str(tmp_path)) == tmp_path
 
 
 @pytest.mark.parametrize(
@@ -70,62 +54,63 @@ def test_a_dataset_is_found_by_folder_name_and_version(home: Path, tmp_path: Pat
 def test_a_missing_dataset_is_refused(home: Path, name: str, fault: str) -> None:
     (home / "ant/data-1.2.0").mkdir(parents=True)
     with pytest.raises(BadInputError, match=fault):
-        locate(name)
+        versions.locate(name)
 
 
 def test_a_successor_names_its_parent_and_its_place(fake: Dataset, home: Path, tmp_path: Path) -> None:
-    description, folder = successor(fake.description, "episodes", stage="subset", config={"count": 2})
+    description, folder = versions.successor(fake.description, "episodes", stage="subset", config={"count": 2})
     assert description["version"] == "1.1.0" and description["parents"] == [fake.identity]
-    assert folder == home_of(description) == home / fake.description["name"] / "data-1.1.0"
+    assert folder == versions.home_of(description) == home / fake.description["name"] / "data-1.1.0"
     folder.mkdir(parents=True)
-    assert successor(fake.description, "episodes", stage="subset", config={})[0]["version"] == "1.2.0"
-    elsewhere = successor(fake.description, "episodes", stage="filter", config={}, out=tmp_path / "here")
+    assert versions.successor(fake.description, "episodes", stage="subset", config={})[0]["version"] == "1.2.0"
+    elsewhere = versions.successor(fake.description, "episodes", stage="filter", config={}, out=tmp_path / "here")
     assert (elsewhere[0]["version"], elsewhere[1]) == ("1.1.0", tmp_path / "here")
-    assert open_dataset(fake.root).reference == fake.reference
+    assert versions.open_dataset(fake.root).reference == fake.reference
 
 
 def test_the_next_version_has_the_columns_of_its_source_and_more(tmp_path: Path) -> None:
     source, other = write_fake(tmp_path / "first"), write_fake(tmp_path / "other")
     labels: dict[str, Any] = {"stage": "label", "config": {}, "simulator": {"id": "one"}}
     more = [Column("phase")]
-    with next_version(
+    with versions.next_version(
         source, "columns", more=more, subset_seed=3, parents=[other.identity], out=tmp_path / "next", **labels
     ) as writer:
         for episode in source.episodes():
             phase = np.zeros(len(episode), np.float32)
             writer.add(replace(episode, columns={**episode.columns, "phase": phase}))
-    written = open_dataset(writer.root)
+    written = versions.open_dataset(writer.root)
     assert written.root == tmp_path / "next" and written.schema == [*source.schema, *more]
     assert (written.task, written.info["fps"]) == (source.task, source.info["fps"])
     assert (written.subset_seed, source.subset_seed) == (3, 0)
     assert written.description["parents"] == [source.identity, other.identity]
     assert (written.description["version"], written.description["simulator"]) == ("2.0.0", {"id": "one"})
-    again = next_version(source, "columns", out=tmp_path / "again", **labels)
+    again = versions.next_version(source, "columns", out=tmp_path / "again", **labels)
     assert again.root == tmp_path / "again"
 
 
 def test_a_successor_of_another_name_begins_anew(home: Path, fake: Dataset) -> None:
     asked: dict[str, Any] = {"stage": "subset", "config": {}, "name": "half"}
-    description, folder = successor(fake.description, "episodes", **asked)
+    description, folder = versions.successor(fake.description, "episodes", **asked)
     assert (description["name"], description["version"]) == ("half", "1.0.0")
     assert description["parents"] == [fake.identity]
     folder.mkdir(parents=True)
-    assert successor(fake.description, "episodes", **asked)[0]["version"] == "1.1.0" and names_at_home() == ["half"]
+    assert versions.successor(fake.description, "episodes", **asked)[0]["version"] == "1.1.0"
+    assert versions.names_at_home() == ["half"]
 
 
 def test_a_name_that_means_a_subset_says_so(home: Path, caplog: pytest.LogCaptureFixture) -> None:
     write_fake(home / "fake/data-1.0.0")
-    assert len(open_dataset("fake")) == 5 and caplog.messages == []
-    subset(open_dataset("fake"), episodes=2)
-    assert len(open_dataset("fake")) == 2
+    assert len(versions.open_dataset("fake")) == 5 and caplog.messages == []
+    subset(versions.open_dataset("fake"), episodes=2)
+    assert len(versions.open_dataset("fake")) == 2
     [message] = caplog.messages
     assert message == "fake is fake@data-1.1.0 here, a subset; the others are fake@data-1.0.0"
-    assert len(open_dataset("fake@1.1.0")) == 2 and len(caplog.messages) == 1
+    assert len(versions.open_dataset("fake@1.1.0")) == 2 and len(caplog.messages) == 1
 
 
 def test_equal_datasets_do_not_differ(tmp_path: Path) -> None:
-    found = differences(write_fake(tmp_path / "a"), write_fake(tmp_path / "b"))
-    assert found == Differences(schema=[], only_in_a=[], only_in_b=[], values=[], metadata={}, description=[])
+    found = versions.differences(write_fake(tmp_path / "a"), write_fake(tmp_path / "b"))
+    assert found == versions.Differences(schema=[], only_in_a=[], only_in_b=[], values=[], metadata={}, description=[])
 
 
 def test_every_kind_of_difference_is_told(fake: Dataset, tmp_path: Path) -> None:
@@ -139,7 +124,7 @@ def test_every_kind_of_difference_is_told(fake: Dataset, tmp_path: Path) -> None
                 values[STATE] = values[STATE] + 1
             metadata = dict(fake_episode(uid, length).metadata) | ({"return": 9.0} if uid == 4 else {})
             open_writer.add(Episode(uid, values, metadata))
-    found = differences(fake, Dataset.open(tmp_path / "b"))
+    found = versions.differences(fake, Dataset.open(tmp_path / "b"))
     assert found.schema == [
         "column mode: only in fake@data-1.0.0",
         "column other: only in fake@data-1.1.0",
@@ -164,7 +149,7 @@ def test_long_lists_of_the_provenance_are_counted(tmp_path: Path) -> None:
         (logs[:6], "60 entries, then 6 entries, 0 of them new"),
     ):
         other = made(str(len(recordings)), recordings)
-        assert differences(long, other).description == [f"config.recordings: {told}"]
+        assert versions.differences(long, other).description == [f"config.recordings: {told}"]
 
 
 pytestmark = pytest.mark.usefixtures("home")
@@ -176,7 +161,7 @@ def test_ancestors_are_found_at_home_and_beside(tmp_path: Path) -> None:
     right = Dataset.open(subset(left, episodes=2, seed=4, out=tmp_path / "right"))
     both = Dataset.open(merge([left, right], new_uids=True, out=tmp_path / "both"))
     prints = [dataset.content_hash[:8] for dataset in (both, left, first, right)]
-    assert list(tree_lines(lineage(both))) == [
+    assert list(versions.tree_lines(versions.lineage(both))) == [
         f"fake@data-1.2.0  {prints[0]}  merge: datasets ['fake@data-1.1.0', 'fake@data-1.2.0'], new_uids True",
         f"├── fake@data-1.1.0  {prints[1]}  filter: without [13]",
         f"│   └── fake@data-1.0.0  {prints[2]}  collect: episodes 5, noise_m 0.1",
@@ -191,16 +176,16 @@ def test_ancestors_are_found_in_the_run(tmp_path: Path, place: str) -> None:
     first = write_fake(tmp_path / "run/label/seed_0")
     made = Dataset.open(filter_episodes(first, without=[13], out=tmp_path / "run" / place))
     found = f"└── fake@data-1.0.0  {first.content_hash[:8]}  "
-    assert list(tree_lines(lineage(made)))[1:] == [f"{found}(not found here)"]
+    assert list(versions.tree_lines(versions.lineage(made)))[1:] == [f"{found}(not found here)"]
     (tmp_path / "run/recipe.json").write_text("{}")
-    assert list(tree_lines(lineage(made)))[1:] == [f"{found}collect: episodes 5, noise_m 0.1"]
+    assert list(versions.tree_lines(versions.lineage(made)))[1:] == [f"{found}collect: episodes 5, noise_m 0.1"]
 
 
 def test_an_ancestor_is_known_by_its_hash(tmp_path: Path) -> None:
     first = write_fake(tmp_path / "elsewhere/first")
     made = Dataset.open(filter_episodes(first, without=[13, 4], out=tmp_path / "made"))
     filter_episodes(made, without=[0], out=tmp_path / "home/fake/data-1.0.0")
-    [line] = list(tree_lines(lineage(made)))[1:]
+    [line] = list(versions.tree_lines(versions.lineage(made)))[1:]
     assert line == f"└── fake@data-1.0.0  {first.content_hash[:8]}  (not found here)"
 
 
@@ -214,7 +199,7 @@ def test_copies_are_counted_as_the_recording_that_they_are_of(tmp_path: Path) ->
 
 
 def test_of_a_thousand_merges_of_two_filters_each_is_told_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def described(folder: Path) -> module.Ancestors:
+    def described(folder: Path) -> versions.Ancestors:
         name = folder.parent.name
         kind, _, number = name.partition("-")
         parents = [f"{one}-{number}" for one in ("left", "right")] if kind == "merge" else []
@@ -222,12 +207,12 @@ def test_of_a_thousand_merges_of_two_filters_each_is_told_once(tmp_path: Path, m
         made_of = [{"name": name, "version": "1.0.0", "hash": name} for name in parents]
         return {(name, "1.0.0", name): (tmp_path, {"stage": kind, "config": {}, "parents": made_of})}
 
-    monkeypatch.setattr(module, "_described", described)
+    monkeypatch.setattr(versions, "_described", described)
     newest = {"name": "merge-1000", "version": "1.0.0", "hash": "merge-1000"}
     [(_, description)] = described(tmp_path / "merge-1000/data-1.0.0").values()  # type: ignore[misc]
-    made = lineage(SimpleNamespace(root=tmp_path, identity=newest, description=description))  # type: ignore[arg-type]
+    made = versions.lineage(SimpleNamespace(root=tmp_path, identity=newest, description=description))  # type: ignore[arg-type]
     # Of each round two filters, the merge before it once for each of them, and that of the first round.
-    assert len(list(tree_lines(made))) == 1 + 1001 * 2 + 1000 * 2 and len(made) == 3 * 1001
+    assert len(list(versions.tree_lines(made))) == 1 + 1001 * 2 + 1000 * 2 and len(made) == 3 * 1001
 
 
 def recorded(folder: Path, names: tuple[str, ...] | None, units: list[str] | None = None) -> Dataset:
@@ -258,7 +243,7 @@ def recorded(folder: Path, names: tuple[str, ...] | None, units: list[str] | Non
 )
 def test_what_contradicts_a_column_is_a_fault(tmp_path: Path, expected: Column, faults: list[str]) -> None:
     logs = recorded(tmp_path / "logs", ("x", "v"), ["m", "m/s"])
-    assert column_faults(logs, expected, "cart") == faults
+    assert versions.column_faults(logs, expected, "cart") == faults
 
 
 @pytest.mark.parametrize(
@@ -277,4 +262,4 @@ def test_names_of_which_none_agrees_are_told(
     logs = recorded(tmp_path / "logs", names)
     columns = [Column(STATE, size=2, names=expected), Column(ACTION, names=("throttle",))]
     text = f"logs@data-1.0.0: takes {told} of observation.state as x, v of cart: check that they are, "
-    assert names_apart(logs, columns, "cart") == (f"{text}in this order" if told else "")
+    assert versions.names_apart(logs, columns, "cart") == (f"{text}in this order" if told else "")
