@@ -1,6 +1,7 @@
 """A robot that follows its commands late, in what is known of it."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from astra_data.dataset.writer import DatasetWriter
 from astra_data.grounding import diagnosis
 from astra_data.pipeline.stages.pair import pair
 from astra_data.reports.diagnosis import diagnosis_page
+from astra_data.robots.registry import pairing_named
 
 SIMULATOR = '''
 import torch
@@ -162,6 +164,12 @@ def test_recordings_that_are_too_short_and_simulators_that_do_not_err_count_for_
     found = recorded(tmp_path, falls=falls, gains=gains)
     assert found.recordings == 12 and len(found.explained) == explained and not found.forecast
     assert any("too few recordings" in line.what for line in found.findings) == (falls > 0)
+
+
+def test_a_tasks_commands_are_within_1_unless_it_has_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    columns = (Column(ACTION, size=2),)
+    monkeypatch.setattr(diagnosis, "pairing_named", lambda name: replace(pairing_named(name), columns=columns))
+    assert [given[2:] for given in recorded(tmp_path).commands.values()] == [(-1.0, 1.0)] * 2
 
 
 def test_commands_that_only_vary_together_are_warned_of(tmp_path: Path) -> None:

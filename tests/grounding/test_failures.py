@@ -129,8 +129,10 @@ def test_it_sees_the_latent_where_only_the_latent_tells(by_latent: bool, monkeyp
 
 def test_the_seed_decides_folds_and_networks(monkeypatch: pytest.MonkeyPatch) -> None:
     episodes, divided = hurried(20, 0), list[Tensor]()
-    fitted = module._descended(untrained(episodes).train(), failing(TASK, episodes), torch.zeros(20, 100, 20))
-    assert not fitted.training  # whose predictions are calibrated
+    known, alike = failing(TASK, episodes), torch.zeros(20, 100, 20)
+    fitted = module._descended(untrained(episodes).train(), known, alike).requires_grad_(False)
+    share = float(known.steps(known.windows.fails_soon).mean())  # though a quarter of each batch fails
+    assert float(fitted.probability(alike[0, :1])) == pytest.approx(share, rel=0.2) and not fitted.training
     monkeypatch.setattr(module, "_cross_fitted", lambda *given: divided.append(torch.stack(given[-1])))
     monkeypatch.setattr(module, "_descended", lambda network, *_: network)
     first, again, other = (fit_failures(TASK, GROUNDING, episodes, seed)[0].members.first for seed in (0, 0, 1))

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 
-from astra_data.core.errors import BadInputError
 from astra_data.robots.nao import kicking
 from astra_data.worlds.plane.mazes import FIELD
 from astra_data.worlds.plane.navigation import VariedPlanar
@@ -39,11 +38,6 @@ def test_balls_within_reach_leave_straight_away_or_turned_and_more_than_a_half_a
     for turn_rad, expected in ((0.0, [1.2, 1.6]), (torch.full((3,), torch.pi / 2), [-1.6, 1.2])):
         _, within, leaving = kicking.Contact(0.35, 2.0, turn_rad).of(torch.zeros(3, 2), ball)
         assert within[:, 0].tolist() == [True, False, True] and leaving[0].tolist() == pytest.approx(expected)
-
-
-def test_commands_without_a_wish_to_kick_are_refused() -> None:
-    with pytest.raises(BadInputError, match=r"expected commands of 3 values, .*, got 2: collect"):
-        kicking.asks_to_kick(torch.zeros(4, 2))
 
 
 BODY: dict[str, Any] = {"timestep_s": 0.2, "radius_m": 0.2, "speed_m_s": 0.25}

@@ -230,6 +230,7 @@ def test_a_fallen_robot_is_told_and_stays_until_its_reset() -> None:
     lying = nao.bodies.state[0].copy()
     nao.step(np.full((2, 3), 0.1))
     np.testing.assert_array_equal(nao.bodies.state[0], lying)
+    assert nao.arrays()["noise"].tolist() == [0, 2]  # each step's is another
     nao.reset(np.array([0]), np.zeros((1, 3)), np.random.default_rng(0))
     assert not nao.bodies.fallen.any()
 
