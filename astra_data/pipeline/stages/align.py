@@ -113,14 +113,16 @@ def align(
             loss = discrepancy + config.paired_weight * distance
             descent.update(loss + _estimate_apart(encoder, windows, state).abs().mean() if config.inputs else loss)
             if descent.done % _MEASURED_EVERY == 0 or descent.done == fitting.updates:
+                encoder.eval()  # a user's may have parts that only learning draws
                 measured = _agreement(model, encoder, held_out, bandwidths)
+                encoder.train()
                 error = measured["mmd"] + config.paired_weight * measured["latent_rmse"] ** 2
                 descent.keep(error + measured.get("estimate_error", 0.0), **measured)
                 rate = descent.done * config.batch_windows / descent.stopwatch.seconds
                 note = f"{rate:,.0f} windows/s  paired latent RMSE {measured['latent_rmse']:.3f}"
                 progress(descent.share, note)
         descent.finish()
-        agreement: dict[str, Any] = {**_agreement(model, encoder, held_out, bandwidths)}
+        agreement: dict[str, Any] = {**_agreement(model, encoder.eval(), held_out, bandwidths)}
         encoder.latent_r2.fill_(agreement["latent_r2"])
         save_target_encoder(folder / TARGET_ENCODER, encoder)
         if config.inputs:

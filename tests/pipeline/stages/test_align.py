@@ -1,5 +1,6 @@
 import json
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,6 @@ from toy_episodes import no_episodes
 
 from astra_data.core.durable import file_digest
 from astra_data.core.errors import BadInputError
-from astra_data.core.progress import Progress
 from astra_data.dataset.columns import ABSTRACT_STATE, STATE, Column
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import next_version
@@ -51,6 +51,7 @@ def test_the_weights_with_the_least_held_out_error_are_kept(
     errors, seen = iter((1.0, 2.0, 3.0)), list[dict[str, torch.Tensor]]()
 
     def measured(_: object, encoder: TargetEncoder, *__: object) -> dict[str, float]:
+        assert not encoder.training
         seen.append({name: values.clone() for name, values in encoder.encoder.state_dict().items()})
         return {"mmd": next(errors), "latent_rmse": 0.0, "latent_r2": 0.5}
 
@@ -132,15 +133,12 @@ def test_where_phi_drops_the_place_the_encoder_does_not_see_it(
 
 def test_after_an_interruption_it_goes_on(paired: Path, grounded: Path, aligned: Path, tmp_path: Path) -> None:
     out = tmp_path / "interrupted"
-
-    def begin(progress: Progress) -> None:
-        align(ALIGN, dataset=paired, grounding=grounded, out=out, progress=progress)
-
+    begin = partial(align, ALIGN, dataset=paired, grounding=grounded, out=out)
     with pytest.raises(Stopped):
-        begin(stop_past(0.0))
+        begin(progress=stop_past(0.0))
     assert not out.exists()
     seen: list[float] = []
-    begin(lambda done, note: seen.append(done))
+    begin(progress=lambda done, note: seen.append(done))
     assert seen == [1.0]
     name = "target_encoder.safetensors"
     assert (out / name).read_bytes() == (aligned / name).read_bytes()
