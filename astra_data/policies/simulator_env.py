@@ -154,14 +154,11 @@ class SimulatorEnv:
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return all that `load_state_dict` needs to continue from here."""
-        changes = {"command": self._command} if self.world.change_penalty else {}
-        return {"goal": self.goal} | changes | self.simulator.state_dict()
+        return {"goal": self.goal, "command": self._command} | self.simulator.state_dict()
 
     def load_state_dict(self, state: dict[str, Tensor]) -> Tensor:
         """Continue from `state`; return the observations (B, O)."""
-        self.goal = state["goal"].clone()
-        if self.world.change_penalty:
-            self._command = state["command"].clone()
+        self.goal, self._command = state["goal"].clone(), state["command"].clone()
         self.simulator.load_state_dict(state)
         return self._observe()
 

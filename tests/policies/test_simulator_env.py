@@ -47,7 +47,8 @@ def risky(count: int, risk: float, reward: Any = "abstract", **options: Any) -> 
     one = simulator_env.SimulatorEnv(NAVIGATION, simulator, simulator_env.WorldConfig(reward=reward), **options)
     state = torch.tensor([[-4.0, 4.0, 0.0, 0.0], [-3.54, -4.0, 0.0, 0.0]]).repeat(count // 2, 1)
     goal = torch.tensor([[-4.0, -4.0]]).expand(count, 2)
-    one.load_state_dict({"state": state, "goal": goal, "hidden": torch.zeros(count, 8)})
+    begun = {"state": state, "goal": goal, "command": torch.zeros(count, 2), "hidden": torch.zeros(count, 8)}
+    one.load_state_dict(begun)
     return one
 
 
