@@ -139,7 +139,10 @@ class Dataset:
         """Return the episode indices `episodes`, by default all, in the dataset's order."""
         if episodes is None:
             return np.arange(len(self))
-        chosen, counts = np.unique(np.array(list(episodes), dtype=np.int64), return_counts=True)
+        given = np.array(list(episodes))
+        if len(given) and given.dtype.kind not in "iu":
+            raise BadInputError(f"{self.reference}: expected indices of episodes, such as np.flatnonzero of a mask")
+        chosen, counts = np.unique(given.astype(np.int64), return_counts=True)
         outside = chosen[(chosen < 0) | (chosen >= len(self))]
         faults = [f"has no episode {episode}, expected 0 to {len(self) - 1}" for episode in outside]
         faults += [f"episode {episode} is listed twice" for episode in chosen[counts > 1]]

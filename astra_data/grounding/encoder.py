@@ -26,7 +26,9 @@ def mlp(
     """
     layers: list[nn.Module] = [nn.Linear(sizes[0], sizes[1])]
     for size_in, size_out in pairwise(sizes[1:]):
-        layers += [*[nn.LayerNorm(size_in)] * norm, activation(inplace=inplace), nn.Linear(size_in, size_out)]
+        if norm:
+            layers.append(nn.LayerNorm(size_in))
+        layers += [activation(inplace=inplace), nn.Linear(size_in, size_out)]
     return nn.Sequential(*layers)
 
 

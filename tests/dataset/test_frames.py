@@ -83,6 +83,8 @@ def test_faults_are_told_at_once(fake: Dataset, frames: Frames) -> None:
         Frames.load(fake, [STATE], episodes=[2, 5, 2, -1])
     with pytest.raises(BadInputError, match="no episodes are listed"):
         Frames.load(fake, [STATE], episodes=[])
+    with pytest.raises(BadInputError, match=r"expected indices of episodes, such as np\.flatnonzero of a mask"):
+        Frames.load(fake, [STATE], episodes=[False, True, False, False, False])
     with pytest.raises(BadInputError, match=r"has no column speed; it has observation\.state"):
         Frames.load(fake, ["speed"])
 
