@@ -71,7 +71,7 @@ def test_it_reads_the_same_episodes(both: tuple[Any, ...]) -> None:
     same = ("state", "action", "previous_action", "goal", "simulated_next", "next_state", "mask")
     for name in same:
         torch.testing.assert_close(theirs[name], getattr(episodes.windows, name))
-    torch.testing.assert_close(theirs["reward"], recorded_rewards(episodes.windows))
+    torch.testing.assert_close(*map(episodes.steps, (theirs["reward"], recorded_rewards(episodes.windows))))
     assert torch.equal(theirs["learns_reward"], episodes.windows.goes_on)
     assert torch.equal(theirs["target_state"], episodes.target_state)
 
