@@ -15,7 +15,7 @@ from astra_data.grounding.failures import FailureModel, FailureShape
 from astra_data.grounding.model import GroundingModel, GroundingShape
 from astra_data.grounding.paired_episodes import PairedEpisodes, PairedWindows
 from astra_data.grounding.simulator import EpisodeSimulator, FittedGrounding, PlacedSimulator
-from astra_data.worlds.protocols import innermost
+from astra_data.worlds.commands import innermost
 
 _MOST = 2.0  # of the logarithm of a scale: off the data no moment shall scatter by more than e² times the usual
 _DESCENT = DescentConfig(updates=500, learning_rate=2e-3)

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self
 
 from astra_data.core.lazy import Tensor
 from astra_data.grounding.paired_episodes import PairedWindows
-from astra_data.worlds.protocols import RememberingSimulator, TaskSimulator, innermost
+from astra_data.worlds.commands import innermost
+from astra_data.worlds.protocols import RememberingSimulator, TaskSimulator
 from astra_data.worlds.task import Task
 from astra_data.worlds.variation import Variation, VariedSimulator
 

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -132,3 +132,10 @@ class VariedCommands(VariedSimulator):
         parameters = self.by_name()
         scaled = action.clamp(-1.0, 1.0) * (1.0 + parameters["action_scale"])
         return self.simulator.step(noisy_command(scaled, parameters["action_noise"]))
+
+
+def innermost(simulator: Any) -> Any:  # noqa: ANN401 - any object
+    """Return the simulator that `simulator` drives or varies, itself if it is none of others."""
+    while isinstance(simulator, DrivenSimulator | VariedSimulator):
+        simulator = simulator.simulator
+    return simulator

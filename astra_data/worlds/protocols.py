@@ -64,13 +64,6 @@ class Simulator(AbstractSimulator, Protocol):
         """Map target states (B, S) to abstract states (B, X), numpy in, numpy out."""
 
 
-def innermost(simulator: Any) -> Any:  # noqa: ANN401 - any object
-    """Return the simulator that `simulator` drives or varies, itself if it is none of others."""
-    while hasattr(simulator, "simulator"):
-        simulator = simulator.simulator
-    return simulator
-
-
 class TaskSimulator(AbstractSimulator, Protocol):
     """The abstract simulator of a task: corrections may move its states, and its parameters be set row by row."""
 

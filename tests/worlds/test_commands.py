@@ -9,8 +9,7 @@ from small_cart import TASK, Rail
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ACTION
-from astra_data.worlds.commands import Commands, DrivenSimulator, VariedCommands
-from astra_data.worlds.protocols import innermost
+from astra_data.worlds.commands import Commands, DrivenSimulator, VariedCommands, innermost
 from astra_data.worlds.variation import CommandVariation
 
 DRIVE = Commands({"v": (-0.2, 1.0), "w": (-1.5, 1.5)})
@@ -102,7 +101,7 @@ class Walled(Rail):
     """A rail with an end at 1."""
 
     blocked = torch.tensor([True, False])
-    varied = 0
+    varied, simulator = 0, object()  # an engine of its own
 
     def settle(self, before: torch.Tensor, landed: torch.Tensor) -> torch.Tensor:
         self.reset_to(landed.clamp_max(1.0))
