@@ -208,7 +208,7 @@ def open_parquet(path: Path) -> pq.ParquetFile:
 def read_blocks(
     paths: Sequence[Path], names: Sequence[str] | None = None, wanted: Bools | None = None, most: int = BLOCK_VALUES
 ) -> Iterator[pa.Table]:
-    """Yield the columns `names`, by default all, of all files in order, in blocks of whole `wanted` row groups."""
+    """Yield the columns `names`, by default all, of files in order, in blocks of `wanted` row groups, `most` rows."""
     end, enough = 0, min(most, BLOCK_ROWS)
     for path in paths:
         try:

@@ -19,7 +19,7 @@ from astra_data.dataset.columns import Array, Column
 from astra_data.dataset.format import UNREADABLE, open_parquet, read_blocks, to_numpy
 
 TIMESTAMP_TOLERANCE_S = 1e-4  # as LeRobot's own; what float32 cannot tell apart is allowed beside it
-EPISODES_AT_ONCE = 100  # rows of meta/episodes held in memory
+EPISODES_AT_ONCE = 100  # rows of meta/episodes held in memory, rounded up to whole row groups
 MOST_FPS = 2**31  # upper bound of steps per second
 NUMBERS = ("bool", "float16", "float32", "float64", *(f"{u}int{bits}" for u in ("", "u") for bits in (8, 16, 32, 64)))
 _END_FLAGS = (names.TERMINATED, names.TRUNCATED, names.DONE)
@@ -220,7 +220,7 @@ def episodes_files(root: Path) -> list[Path]:
 
 def episode_rows(root: Path, *, statistics: bool) -> Iterator[dict[str, Any]]:
     """Yield the rows of meta/episodes, with or without the episodes' statistics."""
-    for table in read_blocks(episodes_files(root)):
+    for table in read_blocks(episodes_files(root), most=EPISODES_AT_ONCE):
         kept = [name for name in table.column_names if statistics or not name.startswith("stats/")]
         # As Python objects, the statistics of an episode take tens of kilobytes.
         for batch in table.select(kept).to_batches(EPISODES_AT_ONCE):

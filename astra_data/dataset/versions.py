@@ -255,14 +255,11 @@ def _value_differences(
 
 def _fingerprints(dataset: Dataset, names: Sequence[str]) -> dict[int, list[object]]:
     """Return what tells each episode's values in the columns `names` from others, by uid."""
-    return {
-        episode.uid: [
-            (provenance.digest_of(values), values.dtype, values.shape)
-            for name, values in episode.columns.items()
-            if name in names
-        ]
-        for episode in dataset.episodes(names or None)
-    }
+    found: dict[int, list[object]] = {}
+    for episode in dataset.episodes(names or None):
+        columns = [episode.columns[name] for name in names]
+        found[episode.uid] = [(provenance.digest_of(one), one.dtype, one.shape) for one in columns]
+    return found
 
 
 def lineage(dataset: Dataset) -> Ancestors:

@@ -55,6 +55,16 @@ def test_tasks_are_texts_by_their_index(tmp_path: Path, table: dict[str, list[ob
     assert found in read if isinstance(found, str) and isinstance(read, str) else read == found
 
 
+def test_rows_of_episodes_are_read_a_few_at_a_time(tmp_path: Path) -> None:
+    path = tmp_path / "meta/episodes/chunk-000/file-000.parquet"
+    path.parent.mkdir(parents=True)
+    pq.write_table(pa.table({"length": range(300)}), path, row_group_size=100)
+    with path.open("r+b") as file:  # the last hundred cannot be read
+        file.seek(pq.read_metadata(path).row_group(2).column(0).data_page_offset)
+        file.write(bytes(8))
+    assert next(plain.episode_rows(tmp_path, statistics=True)) == {"length": 0}
+
+
 COLUMNS = [plain.PlainColumn(EPISODE_INDEX, "int64", 1), plain.PlainColumn(FRAME_INDEX, "int64", 1)]
 
 

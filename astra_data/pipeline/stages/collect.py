@@ -206,10 +206,12 @@ def suboptimal_by_sac(
     running = RunningPolicy(task, actor, observed="full")
 
     def judge(figures: Mapping[str, float]) -> tuple[float, str]:
-        # Tested episodes last longer than those of the training.
-        trial = derive(seed, f"trial {sac.steps}")
-        begin, starts = (lambda goal: begin_drawing(running, len(goal), trial)), derive(trial, "starts")
-        lasted = fmean(in_target(task, begin, _TEST_EPISODES, starts, num_threads=num_threads).steps)
+        trial = derive(seed, f"trial {sac.steps}")  # tested episodes last longer than those of the training
+
+        def begin(goal: Tensor) -> Act:
+            return begin_drawing(running, len(goal), trial)
+
+        lasted = fmean(in_target(task, begin, _TEST_EPISODES, derive(trial, "starts"), num_threads=num_threads).steps)
         return max(sac.steps / steps, lasted / episode_steps), f"episodes last {lasted:.0f} steps"
 
     return _trained(sac, world, judge, folder, progress, "full")

@@ -150,31 +150,22 @@ def test_walls_end_an_episode_where_the_objective_says_so(objective: Navigation,
 HERE = torch.tensor([[-4.0, 5.85, 0.0, 0.0, 7.0]]).expand(3, 5)
 
 
-def planar(count: int, size: int) -> PlanarStates:
-    class Planar(PlanarStates):
-        state_size = size
-
-    return Planar(U_MAZE, count, timestep_s=0.1, radius_m=0.1, speed_m_s=2.0)
-
-
 class Resting(PlanarStates):
-    """Remembers its commands, and stays where it is."""
+    """Stays where it is."""
 
     def step(self, action: Tensor) -> Tensor:
-        self.action = action
         return self.state
 
 
-def resting(count: int, size: int, variation: PlanarVariation) -> tuple[Resting, VariedPlanar]:
+def resting(count: int, size: int) -> Resting:
     class Sized(Resting):
         state_size = size
 
-    inner = Sized(U_MAZE, count, timestep_s=0.1, radius_m=0.1, speed_m_s=2.0)
-    return inner, VariedPlanar(inner, variation)
+    return Sized(U_MAZE, count, timestep_s=0.1, radius_m=0.1, speed_m_s=2.0)
 
 
 def test_rows_are_set_by_themselves_and_states_handed_out_stay() -> None:
-    states = planar(3, 5)
+    states = resting(3, 5)
     states.reset_to(HERE)
     handed_out = states.state
     states.blocked[:] = True
@@ -202,7 +193,7 @@ def test_steps_that_pass_through_walls_are_refused() -> None:
 
 def test_corrections_keep_as_clear_of_walls_as_they_are_told_and_steps_do_not() -> None:
     """The wall's face is at 6 m; the disc's center comes as close as 0.1 m."""
-    states = planar(3, 5)
+    states = resting(3, 5)
     states.keep_clear(0.5)
     start = HERE.clone()
     start[:, 1] = 5.4
@@ -223,7 +214,7 @@ def test_corrections_keep_as_clear_of_walls_as_they_are_told_and_steps_do_not() 
 
 
 def test_corrections_slide_along_walls_and_keep_all_else() -> None:
-    states = planar(3, 5)
+    states = resting(3, 5)
     landed = HERE.clone()
     landed[0, 1], landed[1, 0], landed[:, 2:] = 5.95, -3.95, 0.5
     states.blocked[2] = True  # in the step before
@@ -235,7 +226,7 @@ def test_corrections_slide_along_walls_and_keep_all_else() -> None:
 
 
 def test_commands_are_clipped_then_turned_then_scaled() -> None:
-    states = planar(2, 4)
+    states = resting(2, 4)
     command = torch.tensor([[3.0, 0.0], [0.5, -0.25]])
     torch.testing.assert_close(states.commanded_velocity(command), torch.tensor([[2.0, 0.0], [1.0, -0.5]]))
     plain = {"friction": 1.0, "action_scale": 0.0, "heading_bias_deg": 0.0, "timestep_scale": 1.0}
@@ -253,7 +244,7 @@ def test_sensors_show_other_states_than_the_true_ones() -> None:
     torch.manual_seed(0)
     names = ("position_noise_m", "velocity_noise_m_s", "ball_position_noise_m", "ball_velocity_noise_m_s")
     widths = {name: (width / 10, width / 10) for width, name in enumerate(names, start=1)}
-    inner, varied = resting(3, 8, BallVariation(**widths))
+    varied = VariedPlanar(inner := resting(3, 8), BallVariation(**widths))
     here = torch.rand(3, 8)
     varied.reset_to(here)
     assert torch.equal(varied.state, here)
