@@ -322,11 +322,11 @@ def pair(
     out: arguments.Out = None,
 ) -> None:
     """Add the abstract simulator's next state, from the same state and action, to every step."""
+    if not dataset.endswith(".toml") and (seeds or jobs is not None):
+        raise BadInputError("pair: with a dataset, leave out --seed and --jobs (these are for recipes)")
     own = {**settings, "simulator": simulator, "name": name, "out": out}
     if arguments.of_recipe(dataset, "pair", own, seeds=seeds, jobs=jobs, root=root):
         return
-    if seeds:
-        raise BadInputError("pair: with a dataset, leave out --seed and --jobs (these are for recipes)")
     if simulator is None:
         raise BadInputError("pair: expected --simulator: a task or path.py:MySimulator")
     _make("pair", simulator, settings, dataset=dataset, name=name, out=out)
