@@ -107,12 +107,12 @@ def test_another_dataset_in_its_place_does_not_cost_the_recording(tmp_path: Path
 
 def test_what_was_prepared_is_kept_after_an_error_and_lost_to_no_other_dataset(tmp_path: Path) -> None:
     with pytest.raises(RuntimeError), staged_writer(tmp_path / "set") as writer:
-        (writer.folder / "training.safetensors").write_text("half")
+        for name in ("training.safetensors", ".written"):  # the hash of what was not published
+            (writer.folder / name).write_text("half")
         raise RuntimeError
     with pytest.raises(BadInputError, match="left an unfinished recording; resume it"), staged_writer(tmp_path / "set"):
         pass
-    write_fake(tmp_path / "other", description={**DESCRIPTION, "name": "other"})
-    (tmp_path / "other").rename(tmp_path / "set")
+    write_fake(tmp_path / "set", description={**DESCRIPTION, "name": "other"})
     again = staged_writer(tmp_path / "set", resume=True)
     with pytest.raises(BadInputError, match=r"another dataset .* which left an unfinished recording in"), again:
         pass
