@@ -66,7 +66,9 @@ def view_run(run: Path, uids: Sequence[int] = (), *, seed: int | None = None, sa
     stream = rerun.RecordingStream("astra-data", recording_id=dataset.reference)
     recorded = stream.binary_stream() if save else None
     try:
-        _ = save or stream.spawn()
+        if not save:
+            stream.spawn()
+            stream.flush()  # without a display the viewer ends only now
     except RuntimeError as error:
         advice = "activate the environment where rerun-sdk is installed, or use --save FILE.rrd"
         reason = str(error).partition("\n")[0]

@@ -6,6 +6,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -41,8 +42,7 @@ window = 10
 latent_size = 4
 held_out_share = 0.25
 """
-LIMITS = torch.tensor([[-0.2, -1.5], [1.0, 1.5]])
-"""Of v in m/s and w in rad/s."""
+LIMITS = torch.tensor([[-0.2, -1.5], [1.0, 1.5]])  # of v in m/s and w in rad/s
 
 
 def read(path: Path) -> dict[str, dict[str, Any]]:
@@ -175,9 +175,9 @@ def test_what_cannot_be_shown_is_refused(
 
 
 def test_a_viewer_that_does_not_open_is_told(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def missing(_: object) -> None:
-        raise RuntimeError("no viewer")
-
-    monkeypatch.setattr("rerun.RecordingStream.spawn", missing)
-    with pytest.raises(BadInputError, match=r"^the viewer does not open \(no viewer\): .* --save FILE\.rrd"):
-        view_run(run)
+    missing = Mock(side_effect=RuntimeError("no viewer"))
+    monkeypatch.setattr("rerun.RecordingStream.flush", missing)
+    for spawn in (missing, Mock()):  # the viewer is not installed, or ends without a display
+        monkeypatch.setattr("rerun.RecordingStream.spawn", spawn)
+        with pytest.raises(BadInputError, match=r"^the viewer does not open \(no viewer\): .* --save FILE\.rrd"):
+            view_run(run)

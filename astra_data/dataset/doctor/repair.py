@@ -74,6 +74,7 @@ def repair(
     unknown = 0
     recorded: list[lerobot.Found] = []
     theirs = {uid for source in sources for uid in source.uids.tolist()}
+    of_several = {source.task for source in sources if "task" in source.metadata}  # which name those of all episodes
     task = " / ".join(str(tasks[index]) for index in sorted(tasks)) or "unknown"
     config, old = {"folder": folder.name}, sources[0].description if sources else remains.old
     description = lerobot.description_of(folder, remains.info, "repair", config)
@@ -93,6 +94,8 @@ def repair(
                 references = " or ".join(source.reference for source in sources)
                 notes.append(f"left out the episode of uid {uid}: its values are not those in {references}")
                 continue
+            named = tasks.get(int(run.columns[names.TASK_INDEX][0]), "unknown")
+            own = known.metadata.get("task", named) if named in of_several else named
             if rows:
                 found = lerobot.found_in(run, rows, tasks, row=0, uid=uid)
                 recorded.append(found)
@@ -100,7 +103,7 @@ def repair(
                     continue
                 known.metadata.update(found.metadata)
             if len(tasks) > 1:
-                known.metadata["task"] = tasks.get(int(run.columns[names.TASK_INDEX][0]), "unknown")
+                known.metadata["task"] = own
             try:
                 values, at = remains.values(run, uid), int(np.median(run.columns[names.EPISODE_INDEX]))
                 steps = len(next(iter(values.values())))
@@ -122,8 +125,7 @@ def repair(
         if (remains.metadata or sources) and unknown:
             notes.append(f"{unknown} episodes have no metadata: they are not among the known ones")
         if len(tasks) > 1:
-            merged = f"the {len(tasks)} tasks were merged into one"
-            notes.append(f"{merged}; each episode's own is in its metadata 'task'")
+            notes.append(f"the {len(tasks)} tasks were merged into one; each episode's own is in its metadata 'task'")
         writer.made = {"repaired": notes}
         writer.policy = policy if (policy := folder / layout.POLICY_PATH).is_file() else None
         if not result.episodes:

@@ -1,4 +1,5 @@
 import json
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -64,15 +65,12 @@ def assert_saved(root: Path, episodes: int) -> None:
 def test_every_saved_episode_of_a_killed_writer_is_recovered(
     killed: Path, tmp_path: Path, case: str, episodes: int, faults: list[str]
 ) -> None:
-    report = check(killed / case)
-    found = "\n".join(report.faults)
+    found = "\n".join(check(killed / case).faults)
     assert all(fault in found for fault in faults) and bool(found) == bool(faults)
     before = {path: path.read_bytes() for path in (killed / case).rglob("*") if path.is_file()}
     repaired = repair(killed / case, out=tmp_path / "saved")
-    assert (repaired.episodes, repaired.frames) == (
-        episodes,
-        sum(map(killed_lerobot.length, range(episodes))) - episodes,  # the last have no next state
-    )
+    frames = sum(map(killed_lerobot.length, range(episodes))) - episodes  # the last have no next state
+    assert (repaired.episodes, repaired.frames) == (episodes, frames)
     assert "force was float64 and is now float32" in repaired.notes
     assert not [note for note in repaired.notes if "lost" in note]
     assert_saved(tmp_path / "saved", episodes)
@@ -81,11 +79,8 @@ def test_every_saved_episode_of_a_killed_writer_is_recovered(
 
 @pytest.mark.parametrize("share", [0.05, 0.62])
 def test_of_a_file_that_was_cut_the_whole_row_groups_are_recovered(killed: Path, tmp_path: Path, share: float) -> None:
-    root = tmp_path / "cut"
-    shutil.copytree(killed / "saved", root)
-    size = (root / DATA).stat().st_size
-    with (root / DATA).open("r+b") as file:
-        file.truncate(int(size * share))
+    root = shutil.copytree(killed / "saved", tmp_path / "cut")
+    os.truncate(root / DATA, int((root / DATA).stat().st_size * share))
     try:
         repaired = repair(root, out=tmp_path / "saved")
     except CorruptDatasetError as error:
@@ -152,8 +147,7 @@ def as_format_2(root: Path, episodes: int = 4) -> Path:
         rows.append({"episode_index": number, "tasks": ["open the door"], "length": length})
         row += length
     features: dict[str, object] = {name: single for name in columns}
-    features |= {name: vector for name in ("observation.state", "action")}
-    features["timestamp"] = {"dtype": "float32", "shape": [1], "names": None}
+    features |= {STATE: vector, "action": vector, "timestamp": single | {"dtype": "float32"}}
     path = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
     info = {"codebase_version": "v2.1", "fps": 10, "features": features, "data_path": path}
     info |= {"total_episodes": episodes, "total_frames": row, "total_tasks": 1, "chunks_size": 1000}
@@ -187,12 +181,10 @@ def test_format_2_is_converted_with_tasks_and_names(tmp_path: Path, lost: int | 
 
 
 def test_tasks_are_known_by_their_index(killed: Path, tmp_path: Path) -> None:
-    root = tmp_path / "set"
-    shutil.copytree(killed / "whole", root)
+    root = shutil.copytree(killed / "whole", tmp_path / "set")
     indices = pq.read_table(root / DATA).column("task_index").to_pylist()
     alter_rows(root / DATA, "task_index", {row: index + 1 for row, index in enumerate(indices)})
-    table = pa.table({"task_index": [1, 2], "task": ["walk", "run"]})
-    pq.write_table(table, root / "meta/tasks.parquet")
+    pq.write_table(pa.table({"task_index": [1, 2], "task": ["walk", "run"]}), root / TASKS)
     (root / EPISODES).unlink()
     notes = repair(root, out=tmp_path / "saved").notes
     saved = Dataset.open(tmp_path / "saved")
@@ -200,11 +192,16 @@ def test_tasks_are_known_by_their_index(killed: Path, tmp_path: Path) -> None:
     assert "the 2 tasks were merged into one; each episode's own is in its metadata 'task'" in notes
     assert saved.metadata["task"] == [killed_lerobot.task(number) for number in range(8)]
     assert saved.task == "walk / run"
+    # Edited by LeRobot, all episodes of such a dataset have the task that names theirs, unless they were given another.
+    edited = shutil.copytree(saved.root, tmp_path / "edited", ignore=shutil.ignore_patterns("astra"))
+    pq.write_table(pa.table({"task_index": [0, 1], "task": [saved.task, "sit"]}), edited / TASKS)
+    alter_rows(edited / DATA, "task_index", dict.fromkeys(range(saved.lengths[0]), 1))
+    repair(edited, out=tmp_path / "joined", like=saved)
+    assert Dataset.open(tmp_path / "joined").metadata["task"] == ["sit", *saved.metadata["task"][1:]]
 
 
 def test_an_episode_that_may_have_been_cut_is_left_out(root: Path, tmp_path: Path) -> None:
-    table = pq.read_table(root / DATA)
-    pq.write_table(table, root / DATA, row_group_size=20)
+    pq.write_table(pq.read_table(root / DATA), root / DATA, row_group_size=20)
     truncate(DATA)(root)
     drop(EPISODES)(root)
     repaired = repair(root, out=tmp_path / "saved")
@@ -225,8 +222,7 @@ def test_metadata_is_joined_by_uid(whole: Dataset, tmp_path: Path) -> None:
     assert joined.description["parents"] == [whole.identity] and joined.reference == "fake@data-1.1.0"
     other = write_fake(tmp_path / "other", description={**DESCRIPTION, "name": "other"})
     repair(edited, out=tmp_path / "merged", like=[whole, other])
-    merged = Dataset.open(tmp_path / "merged")
-    assert merged.description["parents"] == [whole.identity, other.identity]
+    assert Dataset.open(tmp_path / "merged").description["parents"] == [whole.identity, other.identity]
 
 
 def test_lists_without_a_size_are_read_as_lerobots_merge_writes_them(tmp_path: Path) -> None:
