@@ -94,15 +94,10 @@ class Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
     server: Hub
 
-    def do_GET(self) -> None:
-        self._route()
-
-    do_POST = do_PUT = do_DELETE = do_HEAD = do_GET  # noqa: N815
-
     def log_message(self, *_: object) -> None:
         pass
 
-    def _route(self) -> None:
+    def do_GET(self) -> None:
         self.body = self.rfile.read(int(self.headers.get("Content-Length") or 0))
         path = unquote(urlsplit(self.path).path)
         if status := self.server.refuse(self.command, path):
@@ -123,6 +118,8 @@ class Handler(BaseHTTPRequestHandler):
                 getattr(self, name)(**{key: value for key, value in words.items() if value is not None})
                 return None
         return self._answer({"error": f"{self.command} {path} is not served"}, 501)
+
+    do_POST = do_PUT = do_DELETE = do_HEAD = do_GET  # noqa: N815
 
     def _known(self) -> bool:
         return self.headers.get("Authorization") == f"Bearer {TOKEN}" or self.command == "PUT"

@@ -339,7 +339,8 @@ def _datasets(sources: Sequence[Results]) -> list[DatasetUse]:
         if first.content_hash != one.content_hash:
             raise BadInputError(
                 f"{sources[-1].recipe}: expected all merged results to use the same data, got those of "
-                f"{one.stage} seed {one.seed} with content {first.content_hash} and {one.content_hash}"
+                f"{one.stage} seed {one.seed} with content {first.content_hash} and {one.content_hash}: "
+                "processors round differently, so run all rows of a seed on one"
             )
     return [*known.values()]
 

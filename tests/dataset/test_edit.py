@@ -91,8 +91,7 @@ def test_shares_are_rounded_half_up() -> None:
 
 
 def test_percent_is_of_a_given_number_and_nothing_is_repeated(forty: Dataset, tmp_path: Path) -> None:
-    made = subset(forty, percent=150, of=20, out=tmp_path / "more")
-    assert len(Dataset.open(made)) == 30
+    assert len(Dataset.open(subset(forty, percent=150, of=20, out=tmp_path / "more"))) == 30
     with pytest.raises(BadInputError, match=r"150 % of 40 = 60: .*never repeated: collect or augment more"):
         subset(forty, percent=150, out=tmp_path / "too-many")
     with pytest.raises(BadInputError, match="the subset has 0 episodes"):

@@ -182,8 +182,7 @@ def test_mapped_columns_equal_loaded_ones(
     # The second time the raw files serve, and what is written to the tensors stays out of them.
     monkeypatch.setattr(Dataset, "blocks", None)
     mapped.columns[STATE].zero_()
-    again = Frames.load(fake, NAMES, memory_share=0.0)
-    assert torch.equal(again.columns[STATE], frames.columns[STATE])
+    assert torch.equal(Frames.load(fake, NAMES, memory_share=0.0).columns[STATE], frames.columns[STATE])
 
 
 def test_another_value_in_a_raw_file_is_told(fake: Dataset, tmp_path: Path) -> None:

@@ -260,8 +260,7 @@ def test_a_fit_takes_it_from_its_training_episodes_but_as_printed_and_where_touc
     training, held_out = recorded(*[1.0] * 10), recorded(*[0.5] * 10)
     config = GroundConfig(updates=1, batch_windows=1, window=2, latent_size=8)
     fitting = Fitting(task, config, None, training, held_out, 0, "cpu", tmp_path, silent)
-    fit = HistoryFit(latent=False, reward=False, scatter=False, printed=printed)
-    grounding, metrics = fit(fitting)
+    grounding, metrics = HistoryFit(latent=False, reward=False, scatter=False, printed=printed)(fitting)
     assert grounding.fails_at_walls == at_walls
     assert [float(one.windows.state[0, 0, 1]) for one in seen] == [TOP_M - 1.0, TOP_M - 0.5]
     expected = None if printed or at_walls else pytest.approx(1.0, abs=0.11)

@@ -102,5 +102,4 @@ def test_our_metadata_is_joined_again_after_lerobot_deleted_episodes(runs: Runs,
 
 
 def test_lerobot_trains_act_on_it(runs: Runs) -> None:
-    output = assert_succeeded(runs, "train")
-    assert f"step:{TRAINING_STEPS}" in output.replace(" ", "")
+    assert f"step:{TRAINING_STEPS}" in assert_succeeded(runs, "train").replace(" ", "")

@@ -29,8 +29,7 @@ def anymal(path: Path, count: int = 1200) -> dict[str, torch.Tensor]:
 
 def test_a_log_of_pace_arrives_row_by_row(tmp_path: Path) -> None:
     log = anymal(tmp_path / "chirp_data.pt")
-    report = import_dataset([tmp_path / "chirp_data.pt"], PACE, out=tmp_path / "out")
-    dataset = Dataset.open(report.root)
+    dataset = Dataset.open(import_dataset([tmp_path / "chirp_data.pt"], PACE, out=tmp_path / "out").root)
     assert (dataset.lengths.tolist(), dataset.info["fps"]) == ([1199], 400)
     got = dataset.columns([STATE, NEXT_STATE, ACTION])
     np.testing.assert_array_equal(got[STATE], log["dof_pos"][:-1])

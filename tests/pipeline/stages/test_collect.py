@@ -61,11 +61,10 @@ def test_the_seed_decides_everything_and_the_threads_nothing(task: str, tmp_path
 
 @pytest.mark.usefixtures("batches_of_two")
 def test_batches_follow_each_other(task: str, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    config = TINY.model_copy(update={"episodes": 5})
-    collect(task, config, out=out)
-    collect(task, TINY.model_copy(update={"episodes": 2}), out=tmp_path / "two")
-    batched, two = Dataset.open(out), Dataset.open(tmp_path / "two")
+    batched, two = (
+        Dataset.open(collect(task, TINY.model_copy(update={"episodes": count}), out=tmp_path / str(count)))
+        for count in (5, 2)
+    )
     assert batched.uids.tolist() == [0, 1, 2, 3, 4]
     first, second, *others = batched.episodes()
     for one, other in zip((first, second), two.episodes(), strict=True):
