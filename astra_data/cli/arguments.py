@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from astra_data.core.errors import BadInputError
-from astra_data.core.naming import STAGE_NAMES
+from astra_data.core.naming import RUNS, STAGE_NAMES
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -155,13 +155,20 @@ def run_stage(recipe: Path, stage: str, **options: Any) -> Path:
 
 
 def of_recipe(
-    place: str, stage: str, own: Mapping[str, object], *, seeds: Sequence[int] | None, table: str = "", **how: Any
+    place: str,
+    stage: str,
+    own: Mapping[str, object],
+    *,
+    seeds: Sequence[int] | None,
+    jobs: int | None,
+    root: Path = RUNS,
+    table: str = "",
 ) -> bool:
     """Run a stage of the recipe at `place`, if it is one, which sets the stage's `own` options itself."""
     if place.endswith(".toml"):
         if given := [f"--{name.replace('_', '-')}" for name, value in own.items() if value is not None]:
             raise BadInputError(f"{stage}: the recipe's [{table or stage}] sets this: leave out {', '.join(given)}")
-        run_stage(Path(place), stage, seeds=seeds, **how)
-    elif len(seeds or ()) > 1 or how["jobs"] is not None:
+        run_stage(Path(place), stage, seeds=seeds, jobs=jobs, root=root)
+    elif len(seeds or ()) > 1 or jobs is not None:
         raise BadInputError(f"{stage}: give at most one --seed and no --jobs (these are for recipes)")
     return place.endswith(".toml")

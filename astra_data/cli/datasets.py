@@ -218,7 +218,8 @@ def _list_tasks() -> None:
 
     table = Table("task", "commands", "abstract states", "target", "steps/s")
     table.columns[0].no_wrap = True
-    for name, known in {name: task_named(name) for name in known_names()}.items():
+    for name in known_names():
+        known = task_named(name)
         states = known.abstract_state.names or (f"{known.abstract_state.size} values",)
         shown = name if name in TASKS else f"{name} (installed)"
         values = first_few(list(known.limits), 4), first_few(states, 4)

@@ -266,7 +266,8 @@ def check_up(dataset: Dataset, called: str | None = None) -> Checkup:
                 low, high = (end.astype(np.float64) for end in ends)
                 moves = bool(changes.any(axis=1).mean() > STUCK)
                 motions.append((episode.uid, longest_rests(changes) / len(changes), low, high, moves))
-            apart |= {episode.uid: torn_steps(episode)} if NEXT_STATE in columns else {}
+            if NEXT_STATE in columns:
+                apart[episode.uid] = torn_steps(episode)
     # What the import said of rates and of rounding, where the dataset is one.
     notes, topics = (dataset.description.get(key) for key in ("notes", "topics"))
     noted = [*(notes if isinstance(notes, list) else []), *(topics if isinstance(topics, dict) else [])]

@@ -136,8 +136,10 @@ def _takes(function: Callable[..., object], given: Sequence[str]) -> bool:
     """Return whether `function` can be called with as many arguments; what is built in does not tell."""
     try:
         signature(function).bind(*given)
-    except (TypeError, ValueError) as error:
-        return isinstance(error, ValueError)
+    except TypeError:
+        return False
+    except ValueError:
+        return True
     return True
 
 
