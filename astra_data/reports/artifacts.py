@@ -12,11 +12,8 @@ from astra_data.core.artifact import check_intact
 from astra_data.core.config import read_written
 from astra_data.core.errors import BadInputError
 
-EVALUATION = "evaluation.json"
-TRAJECTORIES = "trajectories.safetensors"
-CURVE = "curve.json"
-METRICS = "metrics.json"
-GAP = "gap.json"
+EVALUATION, TRAJECTORIES = "evaluation.json", "trajectories.safetensors"
+CURVE, METRICS, GAP = "curve.json", "metrics.json", "gap.json"
 
 
 class WrittenPart(BaseModel):

@@ -123,14 +123,6 @@ def html(title: str, sections: Sequence[Section], images: Mapping[str, bytes] | 
             if part.type == "image" and (image := shown.get(str(part.attrs["src"]))):
                 part.attrSet("src", f"data:image/png;base64,{b64encode(image).decode()}")
                 part.attrSet("width", f"{int.from_bytes(image[16:20]) // _PIXEL}")  # where a PNG has it
-    folder = files("astra_data.reports")
-    return (
-        (folder / "results.html.template")
-        .read_text(encoding="utf-8")
-        .format(
-            title=escape(title),
-            css=(folder / "results.css").read_text(encoding="utf-8"),
-            links=links,
-            body=reader.renderer.render(tokens, reader.options, {}),
-        )
-    )
+    names, body = ("results.html.template", "results.css"), reader.renderer.render(tokens, reader.options, {})
+    page, css = ((files("astra_data.reports") / name).read_text(encoding="utf-8") for name in names)
+    return page.format(title=escape(title), css=css, links=links, body=body)

@@ -34,16 +34,14 @@ def diagnosis_page(recipe: str, found: Diagnosis, timestep_s: float) -> str:
         "sum of their shares (1: as much as in the simulator), delay their mean lag, dead time and time constant "
         "together. Intervals are a bootstrap over recordings."
     )
-    given_table = TableBlock("", ["command", "1 % lie below", "99 % lie below", "lower bound", "upper bound"], given)
-    delay_table = TableBlock("", ["command", "delay (s) [95 %]", "effect [95 %]", shape], delays)
-    missed_table = TableBlock(
-        "", ["value", "unit", "error (RMS)", "no motion (persistence baseline)", "where"], missed, words=2
-    )
+    given_head = ["command", "1 % lie below", "99 % lie below", "lower bound", "upper bound"]
+    delay_head = ["command", "delay (s) [95 %]", "effect [95 %]", shape]
+    missed_head = ["value", "unit", "error (RMS)", "no motion (persistence baseline)", "where"]
     sections = [
         Section("", [about, Text("" if findings else "Nothing that needs attention.", findings)]),
-        Section("Delay of each command", [delay_table, meaning]),
-        Section("Commands that were given", [given_table]),
-        Section("What the simulator misses, one step ahead", [missed_table]),
+        Section("Delay of each command", [TableBlock("", delay_head, delays), meaning]),
+        Section("Commands that were given", [TableBlock("", given_head, given)]),
+        Section("What the simulator misses, one step ahead", [TableBlock("", missed_head, missed, words=2)]),
     ]
     if found.explained:
         lines = [[name, _with_ends(with_ends(value), 2)] for name, value in found.explained.items()]
@@ -52,9 +50,8 @@ def diagnosis_page(recipe: str, found: Diagnosis, timestep_s: float) -> str:
             "ridge regression on the values, and on the products of two where there are few. What each line explains "
             "beyond the one above: past commands, a delay or a lag; past errors, other state that is hidden."
         )
-        sections.append(
-            Section("What explains that error", [TableBlock("", ["from", "explained [95 %]"], lines), Text(text)])
-        )
+        table = TableBlock("", ["from", "explained [95 %]"], lines)
+        sections.append(Section("What explains that error", [table, Text(text)]))
     if found.forecast:
         sizes, left = found.forecast.sizes, found.forecast.left
         lines = [

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, JsonValue
+from pydantic import BeforeValidator, Field, JsonValue
 
 from astra_data.core.arrays import Floats
 from astra_data.core.config import read_written
@@ -15,7 +15,7 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.naming import reference_of
 from astra_data.grounding.paired_episodes import BINS
 from astra_data.methods import grounded_as, method_role, method_title
-from astra_data.reports.artifacts import Machine
+from astra_data.reports.artifacts import Machine, WrittenPart
 from astra_data.reports.choice import Choice, Judgment, Trials, choice_of
 from astra_data.reports.statistics import LEAST_SEEDS, Estimate, paired_difference, summarize
 from astra_data.worlds.objective import SUCCESS, Score
@@ -31,10 +31,8 @@ NullableFloat = Annotated[float, BeforeValidator(lambda value: float("nan") if v
 """A float whose NaN is null in JSON."""
 
 
-class Facts(BaseModel):
-    """A part of the results; frozen, without unknown keys."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
+class Facts(WrittenPart, extra="forbid"):
+    """A part of the results, without unknown keys."""
 
 
 class Origin(Facts):

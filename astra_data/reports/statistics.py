@@ -152,19 +152,11 @@ def probability_of_improvement(scores: Floats, others: Floats) -> Estimate | Non
     from scipy.stats import bootstrap
 
     def share_of_wins(one: Floats, other: Floats, axis: int = -1) -> Floats:
-        above = np.sign(one[..., :, None] - other[..., None, :])
-        share: Floats = (above + 1).mean(axis=(-2, -1)) / 2
-        return share
+        return np.asarray((np.sign(one[..., :, None] - other[..., None, :]) + 1).mean(axis=(-2, -1)) / 2)
 
-    found = bootstrap(
-        (scores, others),
-        share_of_wins,
-        vectorized=True,
-        method="percentile",
-        n_resamples=REPLICATES,
-        rng=np.random.default_rng(0),
-    ).confidence_interval
-    return Estimate(float(share_of_wins(scores, others)), float(found.low), float(found.high))
+    found = bootstrap((scores, others), share_of_wins, method="percentile", n_resamples=REPLICATES, rng=0)
+    low, high = found.confidence_interval
+    return Estimate(float(share_of_wins(scores, others)), float(low), float(high))
 
 
 def correlation(first: Sequence[Floats], second: Sequence[Floats], *, ranks: bool = False) -> Estimate | None:
@@ -173,18 +165,13 @@ def correlation(first: Sequence[Floats], second: Sequence[Floats], *, ranks: boo
     whole = np.concatenate(pairs, axis=1)
     if whole.shape[1] < LEAST_SEEDS or math.isnan(value := float(_coefficients(whole[None], ranks)[0])):
         return None
-
-    def drawn() -> Floats:
-        rows = [pairs[row] for row in rng.integers(len(pairs), size=len(pairs))]
-        return np.concatenate([pair[:, rng.integers(pair.shape[1], size=pair.shape[1])] for pair in rows], axis=1)
-
     of_a_size: dict[int, list[Floats]] = {}
     for _ in range(REPLICATES):
-        sample = drawn()
-        of_a_size.setdefault(sample.shape[1], []).append(sample)
+        rows = [pairs[row] for row in rng.integers(len(pairs), size=len(pairs))]
+        drawn = np.concatenate([pair[:, rng.integers(pair.shape[1], size=pair.shape[1])] for pair in rows], axis=1)
+        of_a_size.setdefault(drawn.shape[1], []).append(drawn)
     found = [_coefficients(np.stack(samples), ranks) for samples in of_a_size.values()]
-    tails = [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2]
-    low, high = np.nanquantile(np.concatenate(found), tails)
+    low, high = np.nanquantile(np.concatenate(found), [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
     return Estimate(value, float(low), float(high))
 
 
