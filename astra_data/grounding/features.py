@@ -119,17 +119,10 @@ def features(
     if column in source.features:
         raise BadInputError(f"{source.reference} has {column} already: encode the dataset that it was made from")
     size, origin = encoder_named(encoder).size, {"camera": camera, "encoder": encoder, **file_of(encoder)}
-    environment = source.description["environment"]
-    made_by = {**environment.get(MADE_BY, {}), column: origin}
+    environment, more = source.description["environment"], [Column(column, size=size, meaning=f"features of {camera}")]
+    about = {**environment, MADE_BY: {**environment.get(MADE_BY, {}), column: origin}}
     with next_version(
-        source,
-        "columns",
-        stage="features",
-        config=origin,
-        name=name,
-        out=out,
-        more=[Column(column, size=size, meaning=f"features of {camera}")],
-        environment={**environment, MADE_BY: made_by},
+        source, "columns", stage="features", config=origin, name=name, out=out, more=more, environment=about
     ) as writer:
         for index, episode in enumerate(source.episodes()):
             blocks = batched(pictures_of(episode.cameras[camera]), _AT_ONCE)

@@ -9,12 +9,7 @@ from astra_data.policies.train import InSimulator, InTarget, TargetConfig
 
 _FIT = HistoryFit(latent=True, reward=True)
 ASTRA = Method(
-    name="astra",
-    title="ASTRA",
-    color="#009E73",
-    fit=_FIT,
-    learn=InSimulator(reward="predicted"),
-    aligns=True,
+    name="astra", title="ASTRA", color="#009E73", fit=_FIT, learn=InSimulator(reward="predicted"), aligns=True
 )
 
 

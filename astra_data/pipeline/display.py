@@ -12,12 +12,13 @@ from rich.text import Text
 from astra_data.core.progress import Progress as Notes
 from astra_data.pipeline.executors import Event, Watch
 
+Then = Callable[[str], object]  # is called with the key of each item that has finished
 _BAR_WIDTH = 20
 _PACE_S = 120.0  # the pace of the last so many seconds says what time is left
 
 
 @contextmanager
-def display(keys: Collection[str], console: Console, then: Callable[[str], object] = lambda _: None) -> Iterator[Watch]:
+def display(keys: Collection[str], console: Console, then: Then = lambda _: None) -> Iterator[Watch]:
     """Show the progress of the items of these `keys` on `console`; call `then` with each that has finished."""
     if not console.is_terminal:
         yield _PlainDisplay(keys, console, then)
@@ -55,7 +56,7 @@ def shown(key: str) -> Iterator[Notes]:
 class _PlainDisplay:
     """One line per start, tenth and finish of an item."""
 
-    def __init__(self, keys: Collection[str], console: Console, then: Callable[[str], object]) -> None:
+    def __init__(self, keys: Collection[str], console: Console, then: Then) -> None:
         self._total, self._console, self._then = len(keys), console, then
         self._finished, self._tenths = 0, dict.fromkeys(keys, 0)
 
@@ -82,9 +83,7 @@ class _PlainDisplay:
 class _LiveDisplay(_PlainDisplay):
     """One moving line per running item; finished ones become lines above."""
 
-    def __init__(
-        self, keys: Collection[str], console: Console, then: Callable[[str], object], progress: Progress
-    ) -> None:
+    def __init__(self, keys: Collection[str], console: Console, then: Then, progress: Progress) -> None:
         super().__init__(keys, console, then)
         self._progress, self._tasks = progress, dict[str, TaskID]()
         self._whole = progress.add_task(f"0 of {self._total} finished", total=self._total, note="")

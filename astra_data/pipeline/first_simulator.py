@@ -261,19 +261,16 @@ def _headings(states: dict[str, Field], names: dict[str, str], beside: str) -> l
 
 def _drives(commands: Sequence[Field]) -> list[tuple[str, dict[str, str], tuple[str, ...]]]:
     """Return kinds of drives that have such commands, variables of these and lines of a step; then other units."""
-    turning = "heading = heading + turn * TIMESTEP_S"
     along: tuple[str, ...] = (
         "x = x + speed * heading.cos() * TIMESTEP_S",
         "y = y + speed * heading.sin() * TIMESTEP_S",
-        turning,
+        "heading = heading + turn * TIMESTEP_S",
     )
     sides = [side for command in commands if (side := SIDE.search(command.plain))]
     if len(commands) == 2 == len(sides) and len({SIDE.sub("", command.plain) for command in commands}) == 1:
         driven = {c.name: "left" if side[1] else "right" for c, side in zip(commands, sides, strict=True)}
-        speed = "speed = SPEED_PER_COMMAND * (left + right) / 2"
-        return [
-            ("a differential drive", driven, (speed, "turn = SPEED_PER_COMMAND * (right - left) / TRACK_M", *along))
-        ]
+        speed, turn = "speed = SPEED_PER_COMMAND * (left + right) / 2", "SPEED_PER_COMMAND * (right - left) / TRACK_M"
+        return [("a differential drive", driven, (speed, f"turn = {turn}", *along))]
     turns = [c for c in commands if _is_turn_rate(c) or (TURN.fullmatch(c.plain) and c.unit != "m/s")]
     turns = turns or [command for command in commands if command.unit == "rad/s"]
     straight = [command for command in commands if command not in turns]

@@ -282,11 +282,8 @@ class Recipe(Config):
                 raise ValueError(f"expected each of {name} once, got {list(values)}")
         if self.collect is None and self.largest > WHOLE:
             raise ValueError(f"sweep.percent: expected at most {WHOLE} % of data, got {self.largest}")
-        for percent in self.sweep.percent if self.collect else ():
-            if not share(percent, self.collect.episodes):
-                raise ValueError(
-                    f"sweep.percent: {percent} % of {self.collect.episodes} episodes are none: expected more"
-                )
+        if self.collect and (none := [size for size in self.sweep.percent if not share(size, self.collect.episodes)]):
+            raise ValueError(f"sweep.percent: {none[0]} % of {self.collect.episodes} episodes are none: expected more")
         if self.select is None:
             return self
         with as_fault("select.judge: "):

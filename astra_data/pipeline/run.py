@@ -144,12 +144,10 @@ def run_stage(
     recipe, folder = experiment.recipe, experiment.folder
     if stage == "collect" and recipe.data is not None:
         raise BadInputError(f"{recipe_path} uses the data {recipe.data}: there is nothing to collect")
-    selection, results = selected(recipe, methods, seeds), experiment.results if publish else None
-    published = experiment.published() if publish else ()
-    planned = plan(
-        recipe, recipe_path, folder, selection, device=device, reports=selection, publish=results, published=published
-    )
-    make(experiment, _selected(planned, stage, methods), planned, selection, jobs=jobs, device=device)
+    part = selected(recipe, methods, seeds)
+    to: dict[str, Any] = {"publish": experiment.results, "published": experiment.published()} if publish else {}
+    planned = plan(recipe, recipe_path, folder, part, device=device, reports=part, **to)
+    make(experiment, _selected(planned, stage, methods), planned, part, jobs=jobs, device=device)
     return folder / stage
 
 
@@ -243,15 +241,9 @@ def make(
                 done = f"{len(points.keys() & lines)} of {len(points)} points"
                 show(f"{key}  done {headline.text(lines[key][headline.measure])}  ({done})")
 
+        prepare = partial(_prepare, dict(recipe.user_methods))
         with display([item.key for item in items], console, finished) as watch:
-            EXECUTORS[engine](
-                items,
-                jobs=jobs,
-                logs=folder / "logs",
-                watch=watch,
-                prepare=partial(_prepare, dict(recipe.user_methods)),
-                address=address,
-            )
+            EXECUTORS[engine](items, jobs=jobs, logs=folder / "logs", watch=watch, prepare=prepare, address=address)
     made = {item.key for item in items}
     # What was missing may be another now, such as a policy that was removed and is trained on another machine.
     if any(made.intersection(one.inputs) for one in asked if one.key not in made) and to_make_again(asked, experiment):
@@ -309,9 +301,7 @@ def _selected(items: tuple[Item, ...], stage: str, methods: Sequence[str]) -> li
 def _write_points(experiment: Experiment) -> dict[str, dict[str, Any]]:
     """Write the lines of all points that are finished now, if there are any, to `sweep.csv`, and return them."""
     points = selected(experiment.recipe).points().items()
-    lines = {
-        key: _line(experiment, key, one) for key, one in points if (experiment.folder / key / EVALUATION).is_file()
-    }
+    lines = {key: _line(experiment, key, at) for key, at in points if (experiment.folder / key / EVALUATION).is_file()}
     if lines:
         text = StringIO()
         writer = csv.DictWriter(text, [*next(iter(lines.values()))], lineterminator="\n")

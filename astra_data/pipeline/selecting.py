@@ -170,7 +170,7 @@ def choose_by_trials(
         def state() -> str:
             tried = []
             for (row, seed), predicted in zip(rounds[number].candidates, rounds[number].predicted, strict=True):
-                success, of = sheet.counted(number, (row, seed), predicted)
+                success, of = sheet.counted(number, row, seed, predicted)
                 tried.append(choice.Tried(row=row, seed=seed, success=success, predicted=of))
             rounds[number] = rounds[number].model_copy(update={"tried": tried})
             return choice.advice(judged, begun.model_copy(update={"rounds": rounds}))
@@ -253,11 +253,8 @@ class Sheet:
             for one, name in enumerate(named):
                 self.results[f"{number + 1}", f"{each * len(named) + one + 1}", name, *values] = []
 
-    def counted(
-        self, number: int, candidate: tuple[str, int], predicted: Sequence[float]
-    ) -> tuple[list[int], list[float]]:
+    def counted(self, number: int, row: str, seed: int, predicted: Sequence[float]) -> tuple[list[int], list[float]]:
         """Return a candidate's results of a round that count, 1 or 0, with what is `predicted` of the same starts."""
-        row, seed = candidate
         trials = [one for one in self.results if one[0] == f"{number + 1}" and one[2] == f"{row}/seed_{seed}"]
         found = [(self.success(one), of) for one, of in zip(trials, predicted, strict=True)]
         return [one for one, _ in found if one is not None], [of for one, of in found if one is not None]

@@ -48,11 +48,8 @@ class ShippedRecipe:
     def files(self) -> set[Path]:
         """The files that it needs, below `RECIPES`: its base, code, and what its head names."""
         folders = [RECIPES / self.path.parent]
-        methods = (
-            own if isinstance(own, str) else own["method"] for own in self.table.get("user_methods", {}).values()
-        )
-        for code in (str(self.table.get("task", "")), *methods):
-            place = folders[0] / code.partition(":")[0]
+        for own in (self.table.get("task", ""), *self.table.get("user_methods", {}).values()):
+            place = folders[0] / (own if isinstance(own, str) else own["method"]).partition(":")[0]
             folders += [place.resolve().parent] if place.is_file() else []
         named = {Path(name) for name in re.findall(r"recipes/(\S+\.(?:py|toml))", self.head)}
         found = {self.path, *(path for path in named if (RECIPES / path).is_file())}

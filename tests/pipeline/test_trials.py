@@ -380,10 +380,10 @@ def test_keys_fill_the_sheet_and_a_void_trial_is_repeated(tmp_path: Path) -> Non
     again.read()
     again.write()
     assert (tmp_path / "trials.csv").read_text() == text and again.results == made.results
-    assert again.counted(0, ("nas", 3), [0.1, 0.2]) == ([1], [0.1])
-    assert again.counted(0, ("astra", 0), [0.3, 0.4]) == ([0], [0.3])
+    assert again.counted(0, "nas", 3, [0.1, 0.2]) == ([1], [0.1])
+    assert again.counted(0, "astra", 0, [0.3, 0.4]) == ([0], [0.3])
     assert again.fill(0, typing("sf", shown), str)
-    assert again.counted(0, ("astra", 0), [0.3, 0.4]) == ([0, 0], [0.3, 0.4])
+    assert again.counted(0, "astra", 0, [0.3, 0.4]) == ([0, 0], [0.3, 0.4])
     assert again.fill(0, typing("", shown), str)
 
 

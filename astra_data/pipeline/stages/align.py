@@ -95,9 +95,8 @@ def align(
         alike |= {"position_octaves": 0, "sensing": sensing}
     encoder = TargetEncoder(episodes.target_state.shape[-1], shape.goal_size, shape.action_size, **alike).to(device)
     # Where φ drops the robot's place, latents must not depend on where it came from.
-    encoder.set_scales(
-        training.steps(training.target_state), training.steps(training.windows.goal), training.dropped_place, abstract
-    )
+    seen = training.steps(training.target_state), training.steps(training.windows.goal)
+    encoder.set_scales(*seen, training.dropped_place, abstract)
     bandwidths = torch.tensor(_BANDWIDTHS, device=device) * shape.latent_size**0.5
     grounding_digest = file_digest(grounding_file)
     settings_text = as_json(**episodes.named, grounding_sha256=grounding_digest, seed=seed, align=config)
@@ -128,12 +127,8 @@ def align(
         if config.inputs:
             apart = _estimate_apart(encoder, held_out.windows, held_out.target_state)
             agreement |= {"estimate_rmse": (apart.square().mean(0).sqrt() * encoder.abstract_std).tolist()}
-        metrics: dict[str, Any] = made | {
-            **descent.stopwatch.spent(),
-            "points": descent.points,
-            **agreement,
-            "deployed": "target" if encoder.is_deployed else "source",
-        }
+        metrics: dict[str, Any] = made | descent.stopwatch.spent() | {"points": descent.points} | agreement
+        metrics["deployed"] = "target" if encoder.is_deployed else "source"
         (folder / METRICS).write_text(json.dumps(metrics, indent=1))
 
 

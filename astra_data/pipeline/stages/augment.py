@@ -205,15 +205,9 @@ def augment(
     if source.cameras:
         _log.warning(f"{', '.join(source.cameras)} left out: no camera has seen the moved episodes")
     taken, placed, lost, moving = set(source.uids.tolist()), 0, 0, _moving(source)
+    settings, seeds = config.model_dump(mode="json"), source.description["seeds"] | {"augment": seed}
     with next_version(
-        source,
-        "episodes",
-        cameras=False,
-        stage="augment",
-        config=config.model_dump(mode="json"),
-        name=name,
-        out=out,
-        seeds=source.description["seeds"] | {"augment": seed},
+        source, "episodes", cameras=False, stage="augment", config=settings, name=name, out=out, seeds=seeds
     ) as writer:
         for index, episode in enumerate(source.episodes()):
             original = {**episode.metadata, "held_out": bool(held_out[index])}
@@ -264,9 +258,7 @@ def _check(source: Dataset, world: Task) -> None:
         faults.append(f"{ABSTRACT_STATE}: it has been paired; augment its parent, then pair")
     if "held_out" in source.metadata:
         faults.append("held_out: it has been augmented; augment its parent")
-    faults += [
-        f"{column.name}: it has no roles, which say how it is rotated" for column in _moving(source) if not column.roles
-    ]
+    faults += [f"{one.name}: it has no roles, which say how it is rotated" for one in _moving(source) if not one.roles]
     if faults:
         raise BadInputError(f"{source.root} cannot be augmented for {world.name}: {'; '.join(faults)}")
 

@@ -62,15 +62,8 @@ def label(
         out.symlink_to(source.root.resolve())
         return out
     steps = successes = failures = at_goal = 0
-    with next_version(
-        source,
-        "columns",
-        stage="label",
-        config={"task": world.name, "seed": seed, "columns": [column.name for column in more]},
-        name=name,
-        out=out,
-        more=more,
-    ) as writer:
+    settings = {"task": world.name, "seed": seed, "columns": [column.name for column in more]}
+    with next_version(source, "columns", stage="label", config=settings, name=name, out=out, more=more) as writer:
         for number, episode in enumerate(source.episodes(), start=1):
             labeled = with_outcomes(world, episode, seed)
             writer.add(labeled)

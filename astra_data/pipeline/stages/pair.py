@@ -70,23 +70,14 @@ def pair(
     added = [replace(pairing.abstract_state, name=name, meaning=text) for name, text in meanings.items()]
     steps, reset_error, farthest = 0, 0.0, np.zeros(added[0].size)
     jumps = {unit: np.zeros(added[0].size, np.int64) for unit in TURNS}
+    made, settings = {"id": pairing.id, **pairing.origin, **batch.parameters, **bounds}, config.model_dump(mode="json")
     with next_version(
-        source,
-        "columns",
-        stage="pair",
-        config=config.model_dump(mode="json"),
-        name=name,
-        out=out,
-        more=added,
-        simulator={"id": pairing.id, **pairing.origin, **batch.parameters, **bounds},
+        source, "columns", stage="pair", config=settings, name=name, out=out, more=added, simulator=made
     ) as writer:
         for episodes in in_blocks(source.episodes(), _BLOCK):
-            columns = [
-                np.concatenate([one.columns[name] for one in episodes])
-                for name in (keys.STATE, keys.ACTION, keys.NEXT_STATE)
-            ]
-            tolerance = config.reset_tolerance
-            paired, error = pair_steps(pairing, batch, *map(as_rows, columns), tolerance=tolerance, first_step=steps)
+            read, tolerance = (keys.STATE, keys.ACTION, keys.NEXT_STATE), config.reset_tolerance
+            columns = (as_rows(np.concatenate([one.columns[name] for one in episodes])) for name in read)
+            paired, error = pair_steps(pairing, batch, *columns, tolerance=tolerance, first_step=steps)
             reset_error = max(reset_error, error)
             apart = paired[keys.ABSTRACT_NEXT_STATE] - paired[keys.ABSTRACT_SIMULATED_NEXT_STATE]
             for unit, turn in TURNS.items():

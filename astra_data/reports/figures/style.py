@@ -118,11 +118,5 @@ def coverage(counts: Ints, extent: tuple[float, float, float, float], label: str
 def draw_visits(axes: Axes, counts: Ints, extent: tuple[float, float, float, float], most: int) -> AxesImage:
     """Draw `counts` on a logarithmic scale from 1 to `most`, but to 2 at least; others as in `coverage`."""
     axes.grid(visible=False)
-    return axes.imshow(
-        np.where(counts > 0, counts, np.nan),
-        origin="lower",
-        extent=extent,
-        cmap="viridis",
-        norm=LogNorm(vmin=1, vmax=max(2, most)),
-        interpolation="nearest",
-    )
+    shown, norm = np.where(counts > 0, counts, np.nan), LogNorm(vmin=1, vmax=max(2, most))
+    return axes.imshow(shown, origin="lower", extent=extent, cmap="viridis", norm=norm, interpolation="nearest")
