@@ -113,9 +113,8 @@ def diagnose(dataset: str | Path, simulator: str, progress: Progress = silent) -
         *_of_commands(log, commands),
         *(_of_forecast(forecast, missed) if known.error.size else ()),
     )
-    return Diagnosis(
-        source.reference, recordings, len(log.step), responses, missed, commands, explained, forecast, findings
-    )
+    size = recordings, len(log.step)
+    return Diagnosis(source.reference, *size, responses, missed, commands, explained, forecast, findings)
 
 
 @dataclass(frozen=True)
@@ -132,15 +131,9 @@ class _Log:
 
     @classmethod
     def of(cls, source: Dataset) -> "_Log":
-        names = (
-            keys.ABSTRACT_STATE,
-            keys.STATE,
-            keys.ACTION,
-            keys.ABSTRACT_SIMULATED_NEXT_STATE,
-            keys.ABSTRACT_NEXT_STATE,
-        )
-        columns = source.columns(names)
-        lengths = source.lengths
+        after = (keys.ABSTRACT_SIMULATED_NEXT_STATE, keys.ABSTRACT_NEXT_STATE)
+        names = (keys.ABSTRACT_STATE, keys.STATE, keys.ACTION, *after)
+        columns, lengths = source.columns(names), source.lengths
         step = np.concatenate([np.arange(length) for length in lengths])
         state, target_state, action, landed, next_state = (as_rows(columns[name]).astype(np.float64) for name in names)
         recording = np.repeat(source.recordings, lengths)
@@ -227,12 +220,11 @@ def _refitted(features: Floats, moved: Floats, recording: Ints, axes: int) -> Fl
     whole, right = np.tensordot(counts, squares, 1), counts @ products
     whole += (1e-6 * np.trace(whole[0]) / size + 1e-12) * np.eye(size)
     lag, criterion, best = np.arange(size) % (size // axes), np.inf, np.zeros_like(right)
+    power = (moved**2).sum()
     for longest in range(size // axes):
         part = np.flatnonzero(lag <= longest)
         weights = np.linalg.solve(whole[:, part[:, None], part], right[:, part, None])[..., 0]
-        wrong = (
-            (moved**2).sum() - 2 * weights[0] @ right[0, part] + weights[0] @ whole[0][np.ix_(part, part)] @ weights[0]
-        )
+        wrong = power - 2 * weights[0] @ right[0, part] + weights[0] @ whole[0][np.ix_(part, part)] @ weights[0]
         now = len(moved) * np.log(max(wrong, 1e-12)) + len(part) * np.log(len(moved))
         if now < criterion:
             criterion, best = now, np.zeros_like(right)
@@ -251,11 +243,8 @@ def _missed(log: _Log, pairing: Pairing) -> tuple[Missed, ...]:
     speed = np.linalg.norm((log.next_state - log.state) / (log.state.std(axis=0) + 1e-9), axis=1)
     command = np.linalg.norm(log.action - log.action.mean(axis=0), axis=1)
     factors = {"fast": speed, "commands are far from their mean": command}
-    for role, part in column.roles:
-        if role == "position":
-            factors["far from the middle"] = np.linalg.norm(
-                log.state[:, part] - log.state[:, part].mean(axis=0), axis=1
-            )
+    for place in (log.state[:, part] for role, part in column.roles if role == "position"):
+        factors["far from the middle"] = np.linalg.norm(place - place.mean(axis=0), axis=1)
     for index, (name, unit) in enumerate(zip(column.labels, column.units, strict=True)):
         square = log.error[:, index] ** 2
         still = np.sqrt(((log.next_state - log.state)[:, index] ** 2).mean())
@@ -314,10 +303,7 @@ class _Error:
         return left
 
     def share_left(self, recordings: Ints, tested: Ints) -> float:
-        """Return the share of the error's variance that histories leave of `tested`, fitted to `recordings`.
-
-        A mean over the values, of which each is at most 1.
-        """
+        """Return the share of error variance, at most 1, that histories fitted to `recordings` leave of `tested`."""
         out, sets = np.isin(self.recording, tested), [self.present, self.commands, self.past]
         wrong = self.left(sets, np.isin(self.recording, recordings), out)
         return float(np.minimum(1.0, (wrong**2).mean(axis=0) / self.error.var(axis=0)).mean())

@@ -20,10 +20,7 @@ _LEAST = 1e-3  # lower bound of a deviation
 def mlp(
     sizes: tuple[int, ...], activation: type[nn.ELU | nn.ReLU] = nn.ELU, *, inplace: bool = False, norm: bool = False
 ) -> nn.Sequential:
-    """Build linear layers of `sizes` with `activation`, after a `norm` of layers, between.
-
-    `inplace` saves time for batches (N, size) only.
-    """
+    """Build linear layers of `sizes` with `activation`, after a `norm`, between; `inplace` is for (N, size) alone."""
     layers: list[nn.Module] = [nn.Linear(sizes[0], sizes[1])]
     for size_in, size_out in pairwise(sizes[1:]):
         if norm:
@@ -211,9 +208,7 @@ class _Recurrence(torch.autograd.Function):
         by_gates = torch.stack([by_reset, by_update, by_own_new], dim=2)
         of_gates, of_state = torch.empty_like(by_gates), torch.empty_like(before)
         later = torch.zeros_like(gradient[0])
-        steps = zip(
-            *(values.unbind() for values in (gradient, by_gates, update, keep, of_gates, of_state)), strict=True
-        )
+        steps = zip(*(one.unbind() for one in (gradient, by_gates, update, keep, of_gates, of_state)), strict=True)
         for now, by_gate, share, kept, of_gate, of_this in reversed(list(steps)):
             torch.add(later, now, out=of_this)
             torch.mul(by_gate, of_this.unsqueeze(1), out=of_gate)

@@ -78,9 +78,7 @@ def encoder_named(name: str, sha256: str = "") -> PictureEncoder:
         made = made() if isinstance(made, type) else made
     size = getattr(made, "size", None)
     if not callable(made) or type(size) is not int or size < 1:
-        raise BadInputError(
-            f"{name}: expected an encoder with `size`, an int, and __call__(pictures), got {made!r:.80}"
-        )
+        raise BadInputError(f"{name}: expected an encoder with an int `size` and __call__(pictures), got {made!r:.80}")
     encoder: PictureEncoder = made
     return encoder
 

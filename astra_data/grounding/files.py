@@ -83,15 +83,11 @@ def load_target_encoder(path: Path | str) -> "TargetEncoder":
 def fitted(returned: object) -> tuple[FittedGrounding, dict[str, Any]]:
     """Return the grounding and the figures that a fit `returned`."""
     if not isinstance(returned, tuple) or len(returned) != 2:
-        raise BadInputError(
-            f"fit returned a {type(returned).__name__}: expected a pair, the grounding and a dict of figures"
-        )
+        raise BadInputError(f"fit returned a {type(returned).__name__}: expected a pair (grounding, dict of figures)")
     grounding, figures = returned
     name = type(grounding).__name__
     if kinds().get(getattr(grounding, "kind", "")) is not type(grounding):
-        raise BadInputError(
-            f"fit returned a {name}, which cannot be read again: expected grounding={name} of the Method"
-        )
+        raise BadInputError(f"fit returned a {name}, which cannot be read: expected grounding={name} of the Method")
     if not isinstance(figures, dict):
         raise BadInputError(f"fit returned a {type(figures).__name__} of figures: expected a dict")
     return grounding, figures

@@ -111,9 +111,7 @@ class PairedEpisodes:
             columns, lengths = _merged(columns, lengths, made_up)
             left = lengths > 0
             if not left.any():
-                raise BadInputError(
-                    f"{root}: no step is left: each episode has a single one, whose next state was made up"
-                )
+                raise BadInputError(f"{root}: no step is left: each episode has one, whose next state was made up")
             lengths, which = lengths[left], which[left]
         if not whole:
             lengths, cut = _pieces(lengths)

@@ -229,9 +229,7 @@ def in_target(
 ) -> Outcome:
     """Run so many episodes side by side, with any `num_threads`; `leg_scale` is a factor on the ant's legs."""
     if leg_scale != 1.0 and "leg_scale" not in task.facts:
-        raise BadInputError(
-            f"leg_scale: the robot of {task.name} has one length of legs: expected 1, got {leg_scale:g}"
-        )
+        raise BadInputError(f"leg_scale: {task.name} has legs of one length: expected 1, got {leg_scale:g}")
     legs = {} if leg_scale == 1.0 else {"leg_scale": leg_scale}
     env = task.target(episodes, seed=seed, num_threads=num_threads, **legs)
     env.reset()

@@ -65,9 +65,7 @@ class RunningPolicy:
         """Check that what the encoder reads is there."""
         reads = getattr(self.target_encoder, "inputs", None)
         if reads and self.sensing is None:
-            raise BadInputError(
-                f"the target encoder reads {', '.join(reads)}, of which the target of a task shows none"
-            )
+            raise BadInputError(f"the target encoder reads {', '.join(reads)}, of which a task's target shows none")
         if self.sensing is not None and self.observed == "full":
             raise BadInputError(f"the policy observes full states: expected no {', '.join(self.sensing.inputs)}")
 
@@ -131,10 +129,8 @@ class RunningPolicy:
         if values.shape != shape:
             raise BadInputError(f"{name}: expected the shape {shape}, got {tuple(values.shape)}")
         if not values.isfinite().all():
-            row, entry = (~values.isfinite()).nonzero()[0].tolist()
-            raise BadInputError(
-                f"{name}: expected finite values, got {values[row, entry]:g} in row {row}, entry {entry}"
-            )
+            row, at = (~values.isfinite()).nonzero()[0].tolist()
+            raise BadInputError(f"{name}: expected finite values, got {values[row, at]:g} in row {row}, entry {at}")
         return values
 
     def act(self, state: Tensor, goal: Tensor) -> Tensor:

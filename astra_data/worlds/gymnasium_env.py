@@ -118,7 +118,7 @@ class GymnasiumRobot:
         return action
 
 
-_TOLERANCE = 1e-4  # of a state that was written and read again: states are float32
+_SAME = {"rtol": 1e-4, "atol": 1e-4}  # of a state that was written and read again: states are float32
 
 
 class GymnasiumSimulator(NumpySimulator):
@@ -158,9 +158,7 @@ class GymnasiumSimulator(NumpySimulator):
                     env.reset(seed=0)
                     write(inner, landed[row])
                     written, shown = landed[row], np.asarray(read(inner))
-                    if shown.shape != written.shape or not np.allclose(
-                        shown, written, rtol=_TOLERANCE, atol=_TOLERANCE
-                    ):
+                    if shown.shape != written.shape or not np.allclose(shown, written, **_SAME):
                         raise BadInputError(
                             f"{env_id}: after write(env, {written.tolist()}) expected the same of read(env), "
                             f"got {shown.tolist()}: write has to set what read returns"

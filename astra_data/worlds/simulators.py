@@ -132,18 +132,6 @@ def wall_geoms(model: "mujoco.MjModel") -> tuple[int, int] | None:
     return (walls[0], walls[-1]) if walls else None
 
 
-def share_out(
-    rows: Iterable[int], pool: ThreadPoolExecutor, work: Callable[[int, Iterator[int]], None], threads: int
-) -> None:
-    """Have `threads`, the caller's and others of `pool`, `work` with their number on some of the `rows`."""
-    # All threads take rows from one iterator (its `next` is atomic), so that none waits for a slower one.
-    waiting = iter(rows)
-    helpers = [pool.submit(work, thread, waiting) for thread in range(1, threads)]
-    work(0, waiting)
-    for helper in helpers:
-        helper.result()
-
-
 class BatchedPhysics:
     """B independent copies of `model`, stepped `substeps` physics steps per control step."""
 
@@ -189,8 +177,16 @@ class BatchedPhysics:
     def step(self, control: Floats, active: Bools | None = None) -> None:
         """Apply `control` (B, nu) for one control step to the copies in `active` (B,), by default to all."""
         self._control[:] = control
-        rows = range(self.num_envs) if active is None else np.flatnonzero(active).tolist()
-        share_out(rows, self._pool, self._step_rows, self.num_threads)
+        self._share_out(range(self.num_envs) if active is None else np.flatnonzero(active).tolist(), self._step_rows)
+
+    def _share_out(self, rows: Iterable[int], work: Callable[[int, Iterator[int]], None]) -> None:
+        """Have this thread and others `work` with their number on some of the `rows`."""
+        # All threads take rows from one iterator (its `next` is atomic), so that none waits for a slower one.
+        waiting = iter(rows)
+        helpers = [self._pool.submit(work, thread, waiting) for thread in range(1, self.num_threads)]
+        work(0, waiting)
+        for helper in helpers:
+            helper.result()
 
     def _step_rows(self, thread: int, rows: Iterator[int]) -> None:
         data = self._data[thread]

@@ -104,12 +104,11 @@ class RobotEnv:
                 found = self._robots[row].step(commands[row])
             if not isinstance(found, tuple) or len(found) != 2:
                 raise BadInputError(f"step of the robot: expected (state, whether it failed), got {found!r}")
-            if found[1] not in (True, False):
-                raise BadInputError(
-                    f"step of the robot: expected True or False for whether it failed, got {found[1]!r}"
-                )
+            state, fell = found
+            if fell not in (True, False):
+                raise BadInputError(f"step of the robot: expected True or False for whether it failed, got {fell!r}")
             self._steps[row] += 1
-            self._state[row], self._fell[row] = self._checked(found[0], "step", row), bool(found[1])
+            self._state[row], self._fell[row] = self._checked(state, "step", row), bool(fell)
         after = self._abstract()
         reached = self._objective.reached(after, self.goal)
         if self._any_end_fails and (reached & self._fell).any():
@@ -120,12 +119,8 @@ class RobotEnv:
             )
         success = reached & ~self._fell
         self.failed = (self._fell | self._objective.missed(after, self.goal)) & ~success
-        return Step(
-            observation=self._observe(),
-            reward=self._objective.reward(before, after, self.goal, self.failed),
-            terminated=success | self.failed,
-            success=success,
-        )
+        reward = self._objective.reward(before, after, self.goal, self.failed)
+        return Step(self._observe(), reward, terminated=success | self.failed, success=success)
 
     def reset_to(self, rows: NDArray[np.intp], state: Floats) -> None:
         """Refuse with a BadInputError: a robot cannot be set to any state."""
@@ -299,9 +294,7 @@ class Task:
             if not isinstance(given := getattr(self, name), kind):
                 raise BadInputError(f"task: {name}: expected {expected}, got {given!r}")
         if not hasattr(self.objective, "action_size"):
-            raise BadInputError(
-                f"task: {_named(type(self.objective))}: expected an action_size, the number of commands"
-            )
+            raise BadInputError(f"task: {_named(self.objective)}: expected an action_size, the number of commands")
         made = self.make_simulator
         while isinstance(made, partial):
             made = made.func

@@ -252,11 +252,9 @@ def parts_of(learned: object) -> tuple[Mapping[str, Tensor], dict[str, Any]]:
     return tensors, metadata
 
 
-def restored[Learned](
-    made: type[Learned], tensors: dict[str, Tensor], metadata: Mapping[str, Any], *device: str
-) -> Learned:
+def restored[Made](made: type[Made], tensors: dict[str, Tensor], metadata: Mapping[str, Any], *device: str) -> Made:
     """Return what `from_file` of the class `made` returns; one of the user's that fails is a BadInputError."""
-    from_file: Callable[..., Learned] = made.from_file  # type: ignore[attr-defined]
+    from_file: Callable[..., Made] = made.from_file  # type: ignore[attr-defined]
     if made.__module__.partition(".")[0] == _PACKAGE.name:
         return from_file(tensors, metadata, *device)
     given = f"given the tensors {', '.join(tensors)} and the values {', '.join(metadata) or 'of nothing'},"

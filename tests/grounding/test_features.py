@@ -118,7 +118,7 @@ def test_the_packages_encoder_says_where_in_a_picture_something_is(source: Datas
         ("top", "One", r"encoders.py:One: expected features of shape \(14, 1\), got \(14, 2\)"),
         ("top", "Infinite", "encoders.py:Infinite: expected finite features, got inf"),
         ("top", "Broken", r"fails with ValueError: no pixel \(encoders.py, line 18\)"),
-        ("top", "sizeless", "expected an encoder with `size`, an int, and __call__"),
+        ("top", "sizeless", "expected an encoder with an int `size` and __call__"),
         ("top", "Missing", "has no 'Missing'; it has Pixels"),
     ],
 )

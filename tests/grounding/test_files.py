@@ -113,15 +113,15 @@ def test_what_a_grounding_of_one_s_own_saves_and_asks_for_is_checked(
 @pytest.mark.parametrize(
     ("returned", "told"),
     [
-        (SHIFTED, "fit returned a Shifted: expected a pair, the grounding and a dict of figures"),
+        (SHIFTED, r"fit returned a Shifted: expected a pair \(grounding, dict of figures\)"),
         (None, "fit returned a NoneType: expected a pair"),
         ((SHIFTED, {}, 1), "fit returned a tuple: expected a pair"),
         ((SHIFTED, 0.5), "fit returned a float of figures: expected a dict"),
         (
             (Lossy(torch.zeros(1)), {}),
-            "fit returned a Lossy, which cannot be read again: expected grounding=Lossy of the Method",
+            "fit returned a Lossy, which cannot be read: expected grounding=Lossy of the Method",
         ),
-        ((torch.zeros(1), {}), "fit returned a Tensor, which cannot be read again"),
+        ((torch.zeros(1), {}), "fit returned a Tensor, which cannot be read: expected"),
     ],
 )
 def test_what_is_no_such_pair_is_refused(returned: object, told: str, known: None) -> None:

@@ -87,7 +87,7 @@ def test_where_no_step_is_one_of_the_robot_there_is_nothing_to_load(
     left = PairedEpisodes.load(whole)
     assert left.lengths.tolist() == [1, 1] and left.reward.tolist() == [[-label(0, 0)], [-label(1, 0)]]
     ended = filter_episodes(Dataset.open(whole), without=[0, 1], out=tmp_path / "ended")
-    with pytest.raises(BadInputError, match="no step is left: each episode has a single one, whose"):
+    with pytest.raises(BadInputError, match="no step is left: each episode has one, whose"):
         PairedEpisodes.load(ended)
 
 

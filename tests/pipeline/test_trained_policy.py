@@ -177,7 +177,7 @@ def test_a_policy_aligned_with_inputs_runs_by_them_and_is_not_deployed_as_a_fold
     ):
         deploy(folder, "astra", tmp_path / "deployed")
     with pytest.raises(
-        BadInputError, match=r"the target encoder reads observation[.]state, of which the target of a task"
+        BadInputError, match=r"the target encoder reads observation[.]state, of which a task's target shows none"
     ):
         evaluate_with(folder, "target", tmp_path / "evaluation")
     evaluate_with(folder, None, tmp_path / "evaluation")

@@ -96,7 +96,7 @@ def test_episodes_end_in_success_in_failure_or_with_their_time() -> None:
 
 @pytest.mark.parametrize("task", [CART, TASKS["nao-navigation"], TASKS["humanoid-walker2d"]])
 def test_only_the_ant_has_legs_of_several_lengths(task: Task) -> None:
-    expected = rf"leg_scale: the robot of {task.name} has one length of legs: expected 1, got 1\.25"
+    expected = rf"leg_scale: {task.name} has legs of one length: expected 1, got 1\.25"
     with pytest.raises(BadInputError, match=expected):
         in_target(task, lambda goal: driving(0.9), 1, seed=3, leg_scale=1.25)
 

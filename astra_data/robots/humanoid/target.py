@@ -230,7 +230,7 @@ def _skeleton(dtype: "torch.dtype", device: "torch.device") -> _Skeleton:
 
     parents = model.body_parentid.tolist()
     joints = [
-        range(first - 1, first - 1 + count) for first, count in zip(model.body_jntadr, model.body_jntnum, strict=True)
+        range(first, first + count) for first, count in zip(model.body_jntadr - 1, model.body_jntnum, strict=True)
     ]
     turns, moved = np.zeros((model.nbody, 9)), np.zeros((len(JOINTS), len(bodies)))
     shares = model.body_mass[bodies] / model.body_mass.sum()

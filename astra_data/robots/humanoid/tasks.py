@@ -345,17 +345,13 @@ Kind = type[HumanoidWalker2d] | type[HumanoidKinematics]
 Quantities = dict[str, tuple[int, ...]]
 
 _JOINT_QUANTITIES = {"joints_rad": (*range(_COUNT),), "joint_rates_rad_s": (*range(_COUNT, 2 * _COUNT),)}
-_BODY_QUANTITIES = {
+_BODY_QUANTITIES = _JOINT_QUANTITIES | {
     name: (*range(2 * _COUNT + first, 2 * _COUNT + first + 3),)
     for name, first in {"mass_m": 0, "mass_velocity_m_s": 3, "up": 6, "spin_rad_s": 9}.items()
 }
 _WALKER_QUANTITIES: Quantities = {
-    "height_m": (0,),
-    "pitch_rad": (1,),
-    "joints_rad": (2, 3, 4, 5),
-    "velocity_m_s": (6, 7),
-    "pitch_rate_rad_s": (8,),
-    "joint_rates_rad_s": (9, 10, 11, 12),
+    **{"height_m": (0,), "pitch_rad": (1,), "joints_rad": (2, 3, 4, 5)},
+    **{"velocity_m_s": (6, 7), "pitch_rate_rad_s": (8,), "joint_rates_rad_s": (9, 10, 11, 12)},
 }
 
 
@@ -363,11 +359,13 @@ def _humanoids(objective: Walking, num_envs: int, **options: Any) -> humanoid.Hu
     return humanoid.HumanoidEnv(objective.locomotion, num_envs, **options)
 
 
-def _task(name: str, walking: Walking, kind: Kind, beyond: Callable[[Tensor], Tensor], quantities: Quantities) -> Task:
+def _task(
+    name: str, walking: type[Walking], kind: Kind, beyond: Callable[[Tensor], Tensor], quantities: Quantities
+) -> Task:
     return Task(
         name=f"humanoid-{name}",
         instruction="walk forward without falling",
-        objective=walking,
+        objective=walking(horizon=_HORIZON),
         make_target=_humanoids,
         target_id="humanoid",
         make_simulator=kind,
@@ -385,16 +383,8 @@ def _task(name: str, walking: Walking, kind: Kind, beyond: Callable[[Tensor], Te
     )
 
 
-WALKER2D = _task(
-    "walker2d", PlanarWalking(horizon=_HORIZON), HumanoidWalker2d, humanoid.beyond_walker2d, _WALKER_QUANTITIES
-)
-KINEMATICS = _task(
-    "kinematics", JointWalking(horizon=_HORIZON), HumanoidKinematics, humanoid.beyond_kinematics, _JOINT_QUANTITIES
-)
+WALKER2D = _task("walker2d", PlanarWalking, HumanoidWalker2d, humanoid.beyond_walker2d, _WALKER_QUANTITIES)
+KINEMATICS = _task("kinematics", JointWalking, HumanoidKinematics, humanoid.beyond_kinematics, _JOINT_QUANTITIES)
 EXTENDED = _task(
-    "extended",
-    MassWalking(horizon=_HORIZON),
-    HumanoidExtendedKinematics,
-    humanoid.beyond_extended_kinematics,
-    _JOINT_QUANTITIES | _BODY_QUANTITIES,
+    "extended", MassWalking, HumanoidExtendedKinematics, humanoid.beyond_extended_kinematics, _BODY_QUANTITIES
 )

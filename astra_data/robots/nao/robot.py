@@ -15,12 +15,11 @@ from numpy.typing import NDArray
 
 from astra_data.core.arrays import Bools, Floats
 from astra_data.core.lazy import mujoco
-from astra_data.core.provenance import cores
 from astra_data.robots.nao import walk
 from astra_data.robots.nao.kicking import BALL_RADIUS_M
 from astra_data.worlds.geometry import rotation_matrix
 from astra_data.worlds.plane.mazes import Maze
-from astra_data.worlds.simulators import BatchedPhysics, add_walls, physics_state, share_out, wall_geoms
+from astra_data.worlds.simulators import BatchedPhysics, add_walls, physics_state, wall_geoms
 
 SUBSTEPS = 3  # physics steps per tick: 4 ms each
 WALL_HEIGHT_M = 0.5
@@ -49,7 +48,7 @@ class BatchedBodies(BatchedPhysics):
     """B bodies of one model; one that has fallen stays as it is until its reset."""
 
     def __init__(
-        self, model: "mujoco.MjModel", traits: walk.Traits, *, longest_delay_ticks: int, num_threads: int
+        self, model: "mujoco.MjModel", traits: walk.Traits, *, longest_delay_ticks: int, num_threads: int | None
     ) -> None:
         count = len(traits.stiffness)
         super().__init__(model, count, substeps=SUBSTEPS, num_threads=num_threads)
@@ -81,8 +80,7 @@ class BatchedBodies(BatchedPhysics):
         before = self.sent.shape[1] - TICKS
         self.sent[rows, :before] = self.sent[rows, TICKS:]
         followed = np.zeros(len(self.fallen), dtype=np.intp)
-        work = partial(self._walk_rows, targets, noise, followed)
-        share_out(rows.tolist(), self._pool, work, self.num_threads)
+        self._share_out(rows.tolist(), partial(self._walk_rows, targets, noise, followed))
         return followed
 
     def _walk_rows(
@@ -169,12 +167,8 @@ class BatchedNao:
         rng = np.random.default_rng(seed)
         self.traits = walk.Traits.draw(self.spread, num_robots, rng)
         self.gait = walk.Gait.standing(num_robots)
-        self.bodies = BatchedBodies(
-            nao_model(maze, ball=ball),
-            self.traits,
-            longest_delay_ticks=self.spread.delay_ticks[1],
-            num_threads=num_threads or cores(),
-        )
+        model, longest = nao_model(maze, ball=ball), self.spread.delay_ticks[1]
+        self.bodies = BatchedBodies(model, self.traits, longest_delay_ticks=longest, num_threads=num_threads)
         self.reset(np.arange(num_robots), np.zeros((num_robots, 3)), rng)
 
     def reset(self, rows: NDArray[np.intp], pose: Floats, rng: np.random.Generator, ball: Floats | None = None) -> None:

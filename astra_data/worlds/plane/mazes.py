@@ -89,9 +89,8 @@ class Maze:
         free = self.clearance_field > radius
         goal_cell = self.fine_index(goal)
         if not free[goal_cell]:
-            raise BadInputError(
-                f"expected a goal farther than {radius:g} m from walls, got ({goal[0]:.2f}, {goal[1]:.2f})"
-            )
+            at = f"({goal[0]:.2f}, {goal[1]:.2f})"
+            raise BadInputError(f"expected a goal farther than {radius:g} m from walls, got {at}")
         numbers = np.full(free.shape, -1, dtype=np.int32)  # as the search takes them, in every version
         numbers[free] = np.arange(free.sum())
         cost = np.ones(free.shape)

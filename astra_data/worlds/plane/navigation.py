@@ -157,12 +157,8 @@ class PlanarTarget(ABC):
         success = self.objective.reached(after, self.goal)
         walls = self.wall_contact & self.objective.ends_at_walls
         self.failed = (torch.from_numpy(fallen) | self.objective.missed(after, self.goal) | walls) & ~success
-        return Step(
-            observation=self._observe(),
-            reward=self.objective.reward(before, after, self.goal, self.failed),
-            terminated=success | self.failed,
-            success=success,
-        )
+        reward = self.objective.reward(before, after, self.goal, self.failed)
+        return Step(self._observe(), reward, terminated=success | self.failed, success=success)
 
     def _observe(self) -> Tensor:
         return torch.cat([self.state, self.goal], dim=-1)
