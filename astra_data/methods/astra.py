@@ -8,9 +8,7 @@ from astra_data.methods.method import Method, Table
 from astra_data.policies.train import InSimulator, InTarget, TargetConfig
 
 _FIT = HistoryFit(latent=True, reward=True)
-ASTRA = Method(
-    name="astra", title="ASTRA", color="#009E73", fit=_FIT, learn=InSimulator(reward="predicted"), aligns=True
-)
+ASTRA = Method("astra", "ASTRA", "#009E73", fit=_FIT, learn=InSimulator(reward="predicted"), aligns=True)
 
 
 def _changed(name: str, title: str, color: str, **changes: Any) -> Method:
@@ -32,20 +30,14 @@ ABLATIONS = (
     _changed("printed", "ASTRA as printed", "#5E4FA2", fit=replace(_FIT, failures=False, scatter=False, printed=True)),
 )
 
-NAS = Method(name="nas", title="NAS", color="#56B4E9", fit=replace(_FIT, latent=False, reward=False))
+NAS = Method("nas", "NAS", "#56B4E9", fit=replace(_FIT, latent=False, reward=False))
 # A recurrent policy trained in the raw simulator and deployed unchanged.
-DIRECT_TRANSFER = Method(name="direct_transfer", title="Direct transfer", color="#E69F00", role="floor")
-DOMAIN_RANDOMIZATION = Method(
-    name="domain_randomization", title="Domain randomization", color="#CC79A7", learn=InSimulator(ranges="randomized")
-)
-COMPASS = Method(name="compass", title="COMPASS", color="#B8A000", learn=InSimulator(ranges="wide"))
+DIRECT_TRANSFER = Method("direct_transfer", "Direct transfer", "#E69F00", role="floor")
+_RANDOMIZED = InSimulator(ranges="randomized")
+DOMAIN_RANDOMIZATION = Method("domain_randomization", "Domain randomization", "#CC79A7", learn=_RANDOMIZED)
+COMPASS = Method("compass", "COMPASS", "#B8A000", learn=InSimulator(ranges="wide"))
+_TABLE = Table("target", TargetConfig)
 TARGET = Method(
-    name="target",
-    title="Target",
-    color="#4D4D4D",
-    role="trained there",
-    learn=InTarget("abstract"),
-    learns_from="target",
-    table=Table("target", TargetConfig),
+    "target", "Target", "#4D4D4D", "trained there", learn=InTarget("abstract"), learns_from="target", table=_TABLE
 )
 FULL_OBS = replace(TARGET, name="full_obs", title="Full Obs", color="#1A1A1A", learn=InTarget("full"))

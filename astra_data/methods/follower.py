@@ -8,7 +8,7 @@ from astra_data.policies.episodes import Act
 from astra_data.worlds.plane.mazes import Maze
 from astra_data.worlds.task import Task
 
-FOLLOWER = Method(name="follower", title="Careful follower", color="#9A9A9A", role="ceiling", learn=None, planar=True)
+FOLLOWER = Method("follower", "Careful follower", "#9A9A9A", role="ceiling", learn=None, planar=True)
 
 
 def careful(task: Task, goal: Tensor) -> Act:

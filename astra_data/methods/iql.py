@@ -309,14 +309,7 @@ def experience_of(task: Task, episodes: PairedEpisodes) -> Experience:
     )
 
 
-IQL = Method(
-    name="iql",
-    title="IQL",
-    color="#D55E00",
-    learn=learn_from_episodes,
-    learns_from="episodes",
-    table=Table("iql", IqlConfig),
-)
+IQL = Method("iql", "IQL", "#D55E00", learn=learn_from_episodes, learns_from="episodes", table=Table("iql", IqlConfig))
 BEHAVIOR_CLONING = replace(
     IQL, name="behavior_cloning", title="Behavior cloning", color="#AA4499", learn=clone_behavior
 )

@@ -52,15 +52,10 @@ class Adaptation(Learner):
         self.student = Student.of_teacher(teacher)
         learned = [parameter for parameter in self.student.parameters() if parameter.requires_grad]
         self._optimizer = torch.optim.Adam(learned, lr=config.adaptation_learning_rate)
-        super().__init__(
-            env,
-            self.student.initial_hidden(env.num_envs),
-            {"student": self.student, "optimizer": self._optimizer},
-            horizon=horizon,
-            total_steps=config.adaptation_steps,
-            rollout_steps=rollout_steps,
-            seed=derive(seed, "adaptation"),
-        )
+        hidden = self.student.initial_hidden(env.num_envs)
+        parts = {"student": self.student, "optimizer": self._optimizer}
+        steps: dict[str, Any] = {"total_steps": config.adaptation_steps, "rollout_steps": rollout_steps}
+        super().__init__(env, hidden, parts, horizon=horizon, seed=derive(seed, "adaptation"), **steps)
 
     def _iterate(self) -> dict[str, float]:
         """Take `rollout_steps` batched steps, learning after each; return the estimates' R² as "r2_extrinsics"."""
@@ -128,6 +123,4 @@ class TeacherThenStudent(InSimulator):
         return training.learned(adaptation.student, simulation), curve
 
 
-RMA = Method(
-    name="rma", title="RMA", color="#A6761D", learn=TeacherThenStudent(ranges="wide"), table=Table("rma", RmaConfig)
-)
+RMA = Method("rma", "RMA", "#A6761D", learn=TeacherThenStudent(ranges="wide"), table=Table("rma", RmaConfig))

@@ -44,13 +44,9 @@ class TrainedPolicy:
         encoder = load_target_encoder(self.files["align"]) if "align" in self.files else None
         asked = self.settings.get("evaluate", {}).get("encoder")
         is_used = encoder is not None and (asked == "target" or (asked is None and encoder.is_deployed))
-        return running(
-            task_named(self.settings["task"]),
-            self.file,
-            grounding_at(self.files.get("ground")),
-            encoder if is_used else None,
-            encoder if encoder is not None and encoder.inputs else None,
-        )
+        sensing = encoder if encoder is not None and encoder.inputs else None
+        task, grounding = task_named(self.settings["task"]), grounding_at(self.files.get("ground"))
+        return running(task, self.file, grounding, encoder if is_used else None, sensing)
 
 
 def trained_policy(run: str | Path, row: str, *, seed: int = 0, percent: int | None = None) -> TrainedPolicy:

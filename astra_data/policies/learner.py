@@ -173,10 +173,7 @@ def pace(points: Points, penalties: float) -> float:
 
 
 def penalty_scale(points: Points, mastered: float) -> float:
-    """Return the factor on penalties (0 to 1) after `points`: grows while episodes succeed, else falls.
-
-    In the end a success of `mastered` is enough.
-    """
+    """Return the factor on penalties, 0 to 1: grows while nearly all succeed, later if `mastered` do, else falls."""
     scale, before = 0.0, 0.0
     for number, point in enumerate(points, 1):
         now = float(point["share"] or 0.0)

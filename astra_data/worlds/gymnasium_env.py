@@ -118,7 +118,7 @@ class GymnasiumRobot:
         return action
 
 
-_SAME = {"rtol": 1e-4, "atol": 1e-4}  # of a state that was written and read again: states are float32
+_SAME: dict[str, Any] = {"rtol": 1e-4, "atol": 1e-4}  # of a state that was written and read again: states are float32
 
 
 class GymnasiumSimulator(NumpySimulator):

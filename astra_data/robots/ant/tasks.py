@@ -71,21 +71,10 @@ def canonical_view(qpos: Floats, qvel: Floats, command: Floats) -> tuple[Floats,
     batch = np.arange(len(qpos))[:, None]
     angles, rates = qpos[:, 7:].reshape(-1, 4, 2), qvel[:, 6:].reshape(-1, 4, 2)
     angular = np.einsum("bij,bj->bi", rotation, qvel[:, 3:6])
-    observation = np.concatenate(
-        [
-            qpos[:, 2:3] - 0.6,
-            in_frame(rotation[:, :, 2]),
-            in_frame(qvel[:, 0:3]),
-            in_frame(angular),
-            angles[batch, legs, 0],
-            angles[batch, legs, 1] * signs,
-            rates[batch, legs, 0] * 0.2,
-            rates[batch, legs, 1] * signs * 0.2,
-            in_frame(command),
-        ],
-        axis=1,
-    )
-    return observation, quarters
+    body = [qpos[:, 2:3] - 0.6, *map(in_frame, (rotation[:, :, 2], qvel[:, 0:3], angular))]
+    joints = [angles[batch, legs, 0], angles[batch, legs, 1] * signs]
+    joints += [rates[batch, legs, 0] * 0.2, rates[batch, legs, 1] * signs * 0.2]
+    return np.concatenate([*body, *joints, in_frame(command)], axis=1), quarters
 
 
 def torques_to_body(torques: Floats, quarters: NDArray[np.intp]) -> Floats:

@@ -124,12 +124,8 @@ class BallSight:
 
     def arrays(self) -> dict[str, Floats]:
         """Return the arrays that later estimates depend on, themselves."""
-        return {
-            "seen_ball": self.position,
-            "seen_ball_velocity": self.velocity,
-            "seen_ball_since": self.unseen_s,
-            "seen_ball_error": self._error,
-        }
+        seen = {"seen_ball": self.position, "seen_ball_velocity": self.velocity}
+        return seen | {"seen_ball_since": self.unseen_s, "seen_ball_error": self._error}
 
 
 _PLANAR = [0, 1, 4, 5]
