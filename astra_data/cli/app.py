@@ -47,6 +47,10 @@ def _options(
     ] = False,
 ) -> None:
     """Options before any command."""
+    try:
+        os.getcwd()
+    except FileNotFoundError:
+        raise BadInputError("the folder that this shell is in was removed or replaced: cd to it again") from None
     if logging.lastResort is not None:  # what prints warnings
         logging.lastResort.setFormatter(_InLines())
     if no_fsync:
@@ -103,23 +107,12 @@ for panel, commands in PANELS.items():
     for example, command in commands.items():
         epilog = f"Example: astra-data {example}"
         app.command(example.split()[0], rich_help_panel=panel, epilog=epilog)(arguments.resumable()(command))
-app.add_typer(
-    recipes.shipped, name="recipes", help="List or copy the package's recipes and mappings.", rich_help_panel="Recipes"
-)
-
-
-def _refuse_a_removed_folder() -> None:
-    """Refuse to work in a folder that was removed, or replaced, since the shell went there."""
-    try:
-        os.getcwd()
-    except FileNotFoundError:
-        raise BadInputError("the folder that this shell is in was removed or replaced: cd to it again") from None
+app.add_typer(recipes.shipped, name="recipes", help="List or copy recipes and mappings.", rich_help_panel="Recipes")
 
 
 def main() -> None:
     """Run the command line; print what is expected to happen as one line unless ASTRA_DATA_DEBUG is set."""
     try:
-        _refuse_a_removed_folder()
         app()
     except Exception as error:
         reported = _reported(error)

@@ -19,38 +19,28 @@ if TYPE_CHECKING:
 
 
 _PLACES = "a folder, name@data-1.2.0, or a name (for its highest version)"
-_HAS_ITS_OWN = "The settings below are not for a recipe, which has its own."
+_ITS_OWN = "The settings below are not for a recipe, which has its own."
 DatasetName = Annotated[str, typer.Argument(metavar="DATASET", help=f"A dataset: {_PLACES}.")]
 Source = Annotated[
-    str, typer.Argument(metavar="RECIPE|DATASET", help=f"A recipe (.toml), or a dataset: {_PLACES}. {_HAS_ITS_OWN}")
+    str, typer.Argument(metavar="RECIPE|DATASET", help=f"A recipe (.toml), or dataset: {_PLACES}. {_ITS_OWN}")
 ]
 TaskOrRecipe = Annotated[
-    str,
-    typer.Argument(metavar="RECIPE|TASK", help=f"A recipe (.toml), or a task such as antmaze-umaze. {_HAS_ITS_OWN}"),
+    str, typer.Argument(metavar="RECIPE|TASK", help=f"A recipe (.toml), or a task such as antmaze-umaze. {_ITS_OWN}")
 ]
 StoredSeeds = Annotated[
     list[int] | None,
     typer.Option("--seed", help="Random seed; of a recipe, run only this one.", show_default="stored; all of a recipe"),
 ]
-Out = Annotated[
-    Path | None,
-    typer.Option(help="Folder of the new dataset.", show_default="its place in $ASTRA_DATA_HOME or ./datasets"),
-]
+Out = Annotated[Path | None, typer.Option(help="The new folder.", show_default="in $ASTRA_DATA_HOME or ./datasets")]
 NewName = Annotated[
-    str | None,
-    typer.Option("--name", help="Name of the new dataset, whose next version it is.", show_default="a new version"),
+    str | None, typer.Option(help="Name of the new dataset, whose next version it is.", show_default="a new version")
 ]
 RecipePath = Annotated[Path, typer.Argument(metavar="RECIPE", help="A recipe (TOML file).")]
 RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="The folder of a run, such as runs/cart.")]
-Methods = Annotated[
-    list[str] | None, typer.Option("--method", metavar="ROW", help="Run only this row; may be repeated.")
-]
+Methods = Annotated[list[str] | None, typer.Option("--method", metavar="ROW", help="Only this row; may be repeated.")]
 Seeds = Annotated[list[int] | None, typer.Option("--seed", help="Run only this seed of the recipe; may be repeated.")]
 Device = Annotated[str, typer.Option(help="PyTorch device for the networks: cpu, cuda, cuda:1, …")]
-Jobs = Annotated[
-    int | None,
-    typer.Option(min=1, help="Number of parallel processes.", show_default="one per core; 2 with --device cuda"),
-]
+Jobs = Annotated[int | None, typer.Option(min=1, help="Parallel processes.", show_default="one per core; 2 with cuda")]
 Root = Annotated[Path, typer.Option(help="Folder that contains the runs.")]
 Until = Annotated[
     str | None,

@@ -15,12 +15,8 @@ from astra_data.core.naming import RUNS, first_few, printable
 def subset(
     dataset: arguments.Source,
     episodes: Annotated[int | None, typer.Option(min=1, help="Number of episodes to keep.")] = None,
-    percent: Annotated[
-        int | None, typer.Option(min=1, help="The same as a percentage of --of; may exceed 100.")
-    ] = None,
-    of: Annotated[
-        int | None, typer.Option(min=1, help="Episodes that count as 100 percent.", show_default="all")
-    ] = None,
+    percent: Annotated[int | None, typer.Option(min=1, help="The same in percent of --of; may exceed 100.")] = None,
+    of: Annotated[int | None, typer.Option(min=1, help="Episodes that are 100 percent.", show_default="all")] = None,
     seeds: arguments.StoredSeeds = None,
     name: arguments.NewName = None,
     out: arguments.Out = None,
@@ -32,20 +28,12 @@ def subset(
     own = size | {"name": name, "out": out}
     if arguments.of_recipe(dataset, "subset", own, table="sweep", seeds=seeds, jobs=jobs, root=root):
         return
-    from astra_data.dataset.edit import subset as write
-    from astra_data.dataset.versions import open_dataset
-
-    source = open_dataset(dataset)
-    _report(write(source, **size, seed=seeds[0] if seeds else None, name=name, out=out))
+    _write("subset", dataset, **size, seed=seeds[0] if seeds else None, name=name, out=out)
 
 
 def merge(
-    datasets: Annotated[
-        list[str], typer.Argument(metavar="DATASET", help="Two or more of the same columns, fps, task and simulator.")
-    ],
-    new_uids: Annotated[
-        bool, typer.Option("--new-uids", help="Give new uids to episodes whose uid is already taken.")
-    ] = False,
+    datasets: Annotated[list[str], typer.Argument(metavar="DATASET", help="Of the same columns, fps and simulator.")],
+    new_uids: Annotated[bool, typer.Option("--new-uids", help="Give new uids to episodes whose uid is taken.")] = False,
     name: arguments.NewName = None,
     out: arguments.Out = None,
 ) -> None:
@@ -61,9 +49,7 @@ def filter_(
     without: Annotated[
         list[int] | None, typer.Option(metavar="UID", help="Leave out the episode with this uid; may be repeated.")
     ] = None,
-    success: Annotated[
-        bool | None, typer.Option("--success/--no-success", help="Keep only successes, or only failures.")
-    ] = None,
+    success: Annotated[bool | None, typer.Option("--success/--no-success", help="Keep successes, or failures.")] = None,
     min_return: Annotated[float | None, typer.Option(help="Minimum return.")] = None,
     max_return: Annotated[float | None, typer.Option(help="Maximum return.")] = None,
     min_length: Annotated[int | None, typer.Option(help="Minimum steps.")] = None,
@@ -72,12 +58,9 @@ def filter_(
     out: arguments.Out = None,
 ) -> None:
     """Write a dataset of the episodes that meet every given condition, without some of them."""
-    from astra_data.dataset.edit import filter_episodes
-    from astra_data.dataset.versions import open_dataset
-
     conditions: dict[str, Any] = {"success": success, "min_return": min_return, "max_return": max_return}
     conditions |= {"min_length": min_length, "max_length": max_length, "without": without or ()}
-    _report(filter_episodes(open_dataset(dataset), **conditions, name=name, out=out))
+    _write("filter_episodes", dataset, **conditions, name=name, out=out)
 
 
 def trim(
@@ -87,18 +70,12 @@ def trim(
     still: Annotated[
         bool, typer.Option("--still", help="Remove the steps at either end in which the state does not change.")
     ] = False,
-    without: Annotated[
-        str | None, typer.Option(metavar="CONDITION", help="Remove the steps in which it holds, such as 'v < 0.05'.")
-    ] = None,
+    without: Annotated[str | None, typer.Option(metavar="CONDITION", help="Remove steps such as 'v < 0.05'.")] = None,
     name: arguments.NewName = None,
     out: arguments.Out = None,
 ) -> None:
     """Write a dataset with shorter episodes, or without some of their steps."""
-    from astra_data.dataset.edit import trim as write
-    from astra_data.dataset.versions import open_dataset
-
-    source = open_dataset(dataset)
-    _report(write(source, start_s=start, end_s=end, still=still, without=without, name=name, out=out))
+    _write("trim", dataset, start_s=start, end_s=end, still=still, without=without, name=name, out=out)
 
 
 def resample(
@@ -108,10 +85,7 @@ def resample(
     out: arguments.Out = None,
 ) -> None:
     """Write a dataset at another rate: commands held, states interpolated, times true."""
-    from astra_data.dataset.edit import resample as write
-    from astra_data.dataset.versions import open_dataset
-
-    _report(write(open_dataset(dataset), fps, name=name, out=out))
+    _write("resample", dataset, fps=fps, name=name, out=out)
 
 
 def features(
@@ -136,6 +110,14 @@ def features(
     _report(folder)
 
 
+def _write(edit: str, dataset: str, **options: Any) -> None:
+    """Write what a function of `dataset.edit` makes of a dataset."""
+    from astra_data.dataset import edit as edits
+    from astra_data.dataset.versions import open_dataset
+
+    _report(getattr(edits, edit)(open_dataset(dataset), **options))
+
+
 def _report(folder: Path) -> None:
     from astra_data.dataset.reader import Dataset
     from astra_data.dataset.versions import home_of, versions_at_home
@@ -150,9 +132,7 @@ def _report(folder: Path) -> None:
 
 def inspect(
     dataset: arguments.DatasetName,
-    plot: Annotated[
-        Path | None, typer.Option(help="Folder for figures of positions and velocities.", show_default="no figures")
-    ] = None,
+    plot: Annotated[Path | None, typer.Option(help="Folder for figures of positions and velocities.")] = None,
 ) -> None:
     """Show a dataset's values, episodes, a map of visited positions, and what looks wrong."""
     from rich.console import Console
@@ -233,9 +213,7 @@ def _list_tasks() -> None:
 
 def validate(
     dataset: arguments.DatasetName,
-    with_lerobot: Annotated[
-        bool, typer.Option("--with-lerobot", help="Also compare with what lerobot's own loader reads (slow).")
-    ] = False,
+    with_lerobot: Annotated[bool, typer.Option("--with-lerobot", help="Compare with lerobot's loader (slow).")] = False,
 ) -> None:
     """Check every file and value of a LeRobot dataset and list all errors."""
     from astra_data.dataset.columns import TERMINATED
@@ -272,9 +250,7 @@ def repair(
         list[str] | None,
         typer.Option(metavar="ORIGINAL", help="What LeRobot's tools made DATASET from: its metadata are copied."),
     ] = None,
-    new_uids: Annotated[
-        bool, typer.Option("--new-uids", help="Keep episodes whose uid is already taken, under new uids.")
-    ] = False,
+    new_uids: Annotated[bool, typer.Option("--new-uids", help="Give new uids to episodes whose uid is taken.")] = False,
 ) -> None:
     """Recover the intact episodes of a damaged dataset, of astra-data or LeRobot, into a new one."""
     from astra_data.dataset.doctor.repair import repair as save

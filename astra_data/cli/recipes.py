@@ -21,16 +21,12 @@ def run(
     recipe: arguments.RecipePath,
     methods: arguments.Methods = None,
     seeds: arguments.Seeds = None,
-    percents: Annotated[
-        list[int] | None, typer.Option("--percent", help="Run only this dataset size; may be repeated.")
-    ] = None,
+    percents: Annotated[list[int] | None, typer.Option("--percent", help="Only this size; may be repeated.")] = None,
     jobs: arguments.Jobs = None,
     device: arguments.Device = "cpu",
     until: arguments.Until = None,
     root: arguments.Root = RUNS,
-    engine: Annotated[
-        str, typer.Option(help="processes of this machine, or ray: tasks of a Ray cluster.")
-    ] = "processes",
+    engine: Annotated[str, typer.Option(help="processes here, or ray: tasks of a Ray cluster.")] = "processes",
     address: Annotated[
         str | None,
         typer.Option(help="Of a Ray cluster, whose machines share this folder and installation.", show_default="here"),
@@ -115,9 +111,7 @@ def _of_networks(stage: str, summary: str) -> Callable[..., None]:
 
 
 ground = _of_networks("ground", "Fit each method's correction of the abstract simulator to the pairs.")
-train = _of_networks(
-    "train", "Train policies where each method trains them, for most in the (corrected) abstract simulator."
-)
+train = _of_networks("train", "Train policies where each method does, for most in the (corrected) abstract simulator.")
 align = _of_networks("align", "Fit the target encoder so that its latents match those of the grounding.")
 
 
@@ -127,10 +121,7 @@ def evaluate(
     seeds: arguments.Seeds = None,
     jobs: arguments.Jobs = None,
     root: arguments.Root = RUNS,
-    policy: Annotated[
-        str | None,
-        typer.Option(help="Test this policy of yours instead of the row's: path.py:POLICY. Its code is run."),
-    ] = None,
+    policy: Annotated[str | None, typer.Option(help="Test your own policy, path.py:POLICY. Its code is run.")] = None,
     out: Annotated[Path | None, typer.Option(help="With --policy: the folder to write.")] = None,
 ) -> None:
     """Run the policies in the target environment (if the task has one) and in simulators."""
@@ -153,9 +144,7 @@ def evaluate(
 def report(
     recipe: arguments.RecipePath,
     seeds: arguments.Seeds = None,
-    publish: Annotated[
-        bool, typer.Option("--publish", help="Add the results to those in the folder results/ next to the recipe.")
-    ] = False,
+    publish: Annotated[bool, typer.Option("--publish", help="Add the results to results/ beside the recipe.")] = False,
     root: arguments.Root = RUNS,
 ) -> None:
     """Write the recipe's tables and figures."""
@@ -204,12 +193,8 @@ def select(
     episodes: Annotated[
         int | None, typer.Option(help="Episodes of each policy with each judge.", min=1, show_default="recipe's or 100")
     ] = None,
-    trials: Annotated[
-        int | None, typer.Option(help="Make the final choice with so many episodes in the target.", min=1)
-    ] = None,
-    by_hand: Annotated[
-        bool, typer.Option("--by-hand", help="With --trials: at the robot, by a person who gives each result.")
-    ] = False,
+    trials: Annotated[int | None, typer.Option(help="Choose with so many episodes in the target.", min=1)] = None,
+    by_hand: Annotated[bool, typer.Option("--by-hand", help="With --trials: a person gives each result.")] = False,
     field: Annotated[
         int | None, typer.Option(help="With --trials: number of candidates to try.", show_default="as many as possible")
     ] = None,
@@ -380,12 +365,8 @@ _NAMED = 5  # files that are named in a line
 
 def new(
     name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the robot: a-z, 0-9 and _.")],
-    logs: Annotated[
-        list[Path] | None, typer.Option("--from", help="The robot's logs: CSV files, folders of them, or a dataset.")
-    ] = None,
-    more: Annotated[
-        list[Path] | None, typer.Argument(metavar="[LOG]...", help="More logs, so that --from logs/*.csv works.")
-    ] = None,
+    logs: Annotated[list[Path] | None, typer.Option("--from", help="Logs: CSV files, folders, or a dataset.")] = None,
+    more: Annotated[list[Path] | None, typer.Argument(metavar="[LOG]...", help="More of --from logs/*.csv.")] = None,
     out: Annotated[Path | None, typer.Option(help="The new folder.", show_default="NAME")] = None,
 ) -> None:
     """Start a project for your own robot: a task, a recipe, a mapping of its logs, a test and a page."""

@@ -8,21 +8,14 @@ import typer
 from astra_data.cli.arguments import DatasetName, Out
 from astra_data.core.errors import BadInputError
 
-NotesPath = Annotated[
-    Path | None,
-    typer.Option("--notes", help="TOML file: license, summary, behavior, intended_use, limits.", show_default="none"),
-]
+NotesPath = Annotated[Path | None, typer.Option(help="TOML file: license, summary, behavior, intended_use, limits.")]
 
 
 def import_(
-    recordings: Annotated[
-        list[Path], typer.Argument(metavar="SOURCE", help="Files, folders or archives of one format.")
-    ],
+    recordings: Annotated[list[Path], typer.Argument(metavar="SOURCE", help="Files, folders, archives: one format.")],
     mapping: Annotated[
         Path | None,
-        typer.Option(
-            "--mapping", help="TOML file: which fields become which columns. D4RL, Minari and others need none."
-        ),
+        typer.Option(help="TOML file: which fields become which columns. D4RL, Minari and others need none."),
     ] = None,
     file_format: Annotated[
         str | None,
@@ -31,17 +24,12 @@ def import_(
     out: Out = None,
     name: Annotated[str | None, typer.Option(help="Name of the dataset.", show_default="the mapping's")] = None,
     fps: Annotated[int | None, typer.Option(min=1, help="Steps per second.", show_default="the mapping's")] = None,
-    task: Annotated[
-        str | None, typer.Option(help="What the robot does in the episodes.", show_default="the mapping's")
-    ] = None,
+    task: Annotated[str | None, typer.Option(help="What the robot does in it.", show_default="the mapping's")] = None,
     max_bytes: Annotated[
         int | None,
         typer.Option(min=1, help="Refuse what unpacks to more bytes.", show_default="100 times their size, or 256 MB"),
     ] = None,
-    skip_bad: Annotated[
-        bool,
-        typer.Option("--skip-bad", help="Skip files and episodes that cannot be imported and list them at the end."),
-    ] = False,
+    skip_bad: Annotated[bool, typer.Option("--skip-bad", help="Leave out, and list, what cannot be imported.")] = False,
 ) -> None:
     """Convert logs (CSV, NPZ, HDF5, Parquet, Minari, MCAP, JSON, PyTorch) to a dataset."""
     from astra_data.core.naming import printable
@@ -85,10 +73,7 @@ if TYPE_CHECKING:
 
 def push(
     dataset: DatasetName,
-    url: Annotated[
-        str,
-        typer.Argument(metavar="URL", help="user/name on the Hugging Face Hub, s3://, gs://, or a folder: ./shared"),
-    ],
+    url: Annotated[str, typer.Argument(metavar="URL", help="user/name (Hugging Face Hub), s3://, gs:// or ./shared")],
     notes: NotesPath = None,
     private: Annotated[bool, typer.Option("--private", help="Create the repository on the Hub as private.")] = False,
 ) -> None:
@@ -105,16 +90,10 @@ def push(
 
 
 def pull(
-    source: Annotated[
-        str, typer.Argument(metavar="SOURCE", help="user/name on the Hugging Face Hub, or the folder's URL or path.")
-    ],
+    source: Annotated[str, typer.Argument(metavar="SOURCE", help="user/name on the Hugging Face Hub, URL, or path.")],
     out: Out = None,
-    version: Annotated[
-        str | None, typer.Option(help="Version to download, such as 1.2.0.", show_default="the newest")
-    ] = None,
-    max_bytes: Annotated[
-        int | None, typer.Option(min=1, help="Refuse a dataset whose files are larger in total.", show_default="100 GB")
-    ] = None,
+    version: Annotated[str | None, typer.Option(help="Version, such as 1.2.0.", show_default="the newest")] = None,
+    max_bytes: Annotated[int | None, typer.Option(min=1, help="Refuse larger datasets.", show_default="100 GB")] = None,
 ) -> None:
     """Download and verify a shared dataset; run again to continue, or to verify the copy."""
     from astra_data.io.hub.sharing import MOST_BYTES
