@@ -306,16 +306,13 @@ def commands(column: Column, episodes: Iterable[Array], extremes: Floats, fps: i
     `extremes` (2, A) are the smallest and the largest of all; a choice among few commands has no edge.
     """
     names, held, steps = column.names or ([column.name] if column.size == 1 else column.labels), Counter[int](), 0
-    at_edge, known = np.zeros(column.size, np.int64), list[Array]([np.zeros(0)] * column.size)
+    at_edge, seen = np.zeros(column.size, np.int64), list[Array]([np.zeros(0)] * column.size)
     for actions in episodes:
         held.update(held_steps(actions).tolist())
         at_edge += ((actions == extremes[0]) | (actions == extremes[1])).sum(axis=0)
-        known = [
-            few if len(few) > DISCRETE else np.union1d(few, values)
-            for few, values in zip(known, actions.T, strict=True)
-        ]
+        seen = [few if len(few) > DISCRETE else np.union1d(few, new) for few, new in zip(seen, actions.T, strict=True)]
         steps += len(actions)
-    shares = np.where([len(values) > DISCRETE for values in known], at_edge / steps, 0.0)
+    shares = np.where([len(values) > DISCRETE for values in seen], at_edge / steps, 0.0)
     durations = np.array(sorted(held)) / fps
     count = np.cumsum([held[length] for length in sorted(held)])
     median_s, long_s = (float(durations[np.searchsorted(count, share * count[-1])]) for share in (0.5, 0.95))

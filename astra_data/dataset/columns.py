@@ -86,10 +86,7 @@ class Column:
             f"size {size}, expected 1 to {MOST_VALUES}": 1 <= size <= MOST_VALUES,
             f"{len(names or ())} names for {size} values": names is None or len(names) == size,
             **{f"astra has {key!r}, expected unit, frame, role": key in ("unit", "frame", "role") for key in astra},
-            **{
-                f"{len(each)} words in astra's {key} for {size} values": len(each) == size
-                for key, each in astra.items()
-            },
+            **{f"{len(of)} words in astra's {key} for {size} values": len(of) == size for key, of in astra.items()},
             f"unknown role {unknown}, expected {', '.join(ROLES)}": not unknown,
         }
         faults = unmet(checks) or [

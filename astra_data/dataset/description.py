@@ -72,8 +72,7 @@ def _faults(description: Mapping[str, Any]) -> list[str]:
         f"version {version!r:.80}, expected three numbers such as 1.0.0": (
             isinstance(version, str) and VERSION.fullmatch(version)
         ),
-        f"stage {stage!r:.80}, expected the name of the stage that writes the dataset": isinstance(stage, str)
-        and stage,
+        f"stage {stage!r:.80}, expected the name of the stage that writes it": isinstance(stage, str) and stage,
         f"parents {parents!r:.80}, expected a list": isinstance(parents, Sequence),
     }
     for parent in parents if isinstance(parents, Sequence) else ():

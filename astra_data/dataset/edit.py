@@ -382,17 +382,15 @@ def _interpolated(values: Floats, at: Floats, column: Column, turns: _Turns) -> 
 
 def _write(source: Dataset, change: Change, episodes: Iterable[Episode], **described: Any) -> Path:
     """Write `episodes`, made of those of `source`, as its next version, `described` as `next_version` takes it."""
-    left_out = dict.fromkeys(source.uids.tolist())
+    gone = dict.fromkeys(source.uids.tolist())
     with next_version(source, change, **described) as writer:
         for episode in episodes:
             writer.add(episode)
-            left_out.pop(episode.uid, None)
-        if len(left_out) == len(source):
+            gone.pop(episode.uid, None)
+        if len(gone) == len(source):
             raise BadInputError(f"{source.reference}: none of its {len(source)} episodes would be left")
-    if left_out and described["stage"] in ("trim", "resample"):  # which do not choose among episodes
-        _log.warning(
-            "nothing remains of %d of %d episodes: %s", len(left_out), len(source), first_few([*left_out], SHOWN)
-        )
+    if gone and described["stage"] in ("trim", "resample"):  # which do not choose among episodes
+        _log.warning("nothing remains of %d of %d episodes: %s", len(gone), len(source), first_few([*gone], SHOWN))
     return writer.root
 
 

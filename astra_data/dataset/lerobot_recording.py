@@ -101,10 +101,9 @@ class RecordedFiles:
 def lacking(recorded: Iterable[Column]) -> list[str]:
     """Say what columns of a recording lack without which its rows do not become ours."""
     sizes = {column.name: column.size for column in recorded}
+    singles = (names.REWARD, *_OUTCOME_FLAGS)
     missing = [name for name in (names.STATE, names.ACTION) if name not in sizes]
-    return missing + [
-        f"{name} of a single number" for name in (names.REWARD, *_OUTCOME_FLAGS) if sizes.get(name, 1) > 1
-    ]
+    return missing + [f"{name} of a single number" for name in singles if sizes.get(name, 1) > 1]
 
 
 def our_columns(recorded: Iterable[Column], *, has_tasks: bool) -> list[Column]:

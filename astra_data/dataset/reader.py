@@ -311,9 +311,7 @@ def _read(root: Path) -> dict[str, Any]:
 
 def _parsed(root: Path, description: dict[str, Any]) -> dict[str, Any]:
     """Read what is sealed, and therefore as the writer wrote it, unless somebody forged it."""
-    info, subsets = (
-        json.loads((root / path).read_text(encoding="utf-8")) for path in (layout.INFO_PATH, layout.SUBSETS_PATH)
-    )
+    info, subsets = (json.loads((root / path).read_bytes()) for path in (layout.INFO_PATH, layout.SUBSETS_PATH))
     if not plain.is_data_path(info["data_path"]):
         raise BadInputError(f"expected a path inside the dataset's folder, got {info['data_path']!r}")
     cameras = read_cameras(root, info)

@@ -223,9 +223,7 @@ def differences(a: Dataset, b: Dataset) -> Differences:
 
 def schema_differences(a: Dataset, b: Dataset, described: Sequence[str] = ()) -> list[str]:
     """List how columns, fps and the parts `described` of `b` differ from those of `a`, whatever the columns' order."""
-    ours, theirs = (
-        {column.name: {**vars(column), "astra": column.astra or {}} for column in dataset.schema} for dataset in (a, b)
-    )
+    ours, theirs = ({c.name: {**vars(c), "astra": c.astra or {}} for c in dataset.schema} for dataset in (a, b))
     found = [f"column {name}: only in {a.reference}" for name in ours if name not in theirs]
     found += [f"column {name}: only in {b.reference}" for name in theirs if name not in ours]
     for name in (name for name in ours if name in theirs):

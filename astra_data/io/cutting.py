@@ -346,10 +346,8 @@ class Cutter:
             given = f"'{time}' gives {steps / seconds:.4g} rows per second, but fps is {fps}"
             raise BadInputError(f"{given}: {'; '.join(advice)}")
         if 2 * tally.still_rows > steps:
-            still = f"'{time}' stands still in {tally.still_rows} of {tally.rows} rows, first in {tally.still_first}"
-            raise BadInputError(
-                f"{still}: expected one row at a time: remove copies, or split where another robot begins"
-            )
+            why = f"'{time}' stands still in {tally.still_rows} of {tally.rows} rows, first in {tally.still_first}"
+            raise BadInputError(f"{why}: expected one row at a time: remove copies or split where another robot begins")
         tally.notes += [f"{name}, {fps} Hz declared" for name in named]
         tally.clock = str(self._clock)
 
@@ -383,10 +381,9 @@ class Cutter:
                 source = sources[spec.take[entry] if spec.take else entry]
                 bad[source] = bad.get(source, False) | ~finite[:, entry]
         sizes = {name: column.size for name, column in self._converted.items()} if not faults else {}
-        if sizes.get(keys.NEXT_STATE) not in (None, sizes.get(keys.STATE)):
-            faults.append(
-                f"{keys.NEXT_STATE} has {sizes[keys.NEXT_STATE]} values, {keys.STATE} {sizes.get(keys.STATE, 0)}"
-            )
+        of_state, of_next = sizes.get(keys.STATE, 0), sizes.get(keys.NEXT_STATE)
+        if of_next not in (None, of_state):
+            faults.append(f"{keys.NEXT_STATE} has {of_next} values, {keys.STATE} {of_state}")
         flags = [name for name in (keys.REWARD, *MAPPED_FLAGS) if sizes.get(name, 1) > 1]
         faults += [f"{name}: {sizes[name]} values, expected 1" for name in flags]
         if sizes and (jump := self.mapping.split.jump) and max(jump.values) >= (size := sizes[jump.column]):
@@ -457,8 +454,7 @@ def _cast(values: Array, column: Column) -> tuple[Array, Bools]:
     if column.dtype == "float32":
         if sound.dtype.kind in "iu" and ((sound > EXACT) | (sound < -EXACT)).any():
             raise BadInputError(
-                'integers beyond 2^53 do not fit float32; set dtype = "int64", or a scale or an offset that '
-                "makes them small"
+                'integers beyond 2^53 do not fit float32; set dtype = "int64", or a scale or offset to make them small'
             )
         with np.errstate(over="ignore"):
             cast = np.ascontiguousarray(values, np.float32)

@@ -40,10 +40,8 @@ COMMAND, TORQUE, FORCE = (
     for words in (rf"((.+_)?({COMMANDED})|u)", "(.+_)?(tau|torque|effort|moment)", "(.+_)?(force|thrust)")
 )
 ACTING = (TORQUE, FORCE, re.compile(r"throttle|brake|(steer(ing)?|rudder|aileron|elevator)(_angle)?"))
-NO_PLACE = f"{TURNED}|quat|orient|vel|twist|linear|angular|speed|acc|rate|force|torque|moment"
-PLACE = re.compile(
-    rf"(?!.*({NO_PLACE})|(.+_)?q_)(.+_)?(p|pos)?(?P<axis>[xyz]|east(ing)?|north(ing)?|up|alt(itude)?|depth)"
-)
+_NOT = f"{TURNED}|quat|orient|vel|twist|linear|angular|speed|acc|rate|force|torque|moment"
+PLACE = re.compile(rf"(?!.*({_NOT})|(.+_)?q_)(.+_)?(p|pos)?(?P<axis>[xyz]|east(ing)?|north(ing)?|up|alt(itude)?|depth)")
 GPS = re.compile(r"(?P<stem>(.+_)?)(?P<axis>lat|lon|lng)(itude|gitude)?")
 GAP_STEPS = 5  # periods without a row after which another episode begins
 GOAL_NAME = re.compile(
@@ -306,9 +304,7 @@ def _roles(fields: Sequence[Field]) -> list[Field]:
     seen: set[Role] = set()
     for field in sorted(fields, key=lambda field: field.why.endswith("(CHECK)")):
         if field.role in seen & {"failure", "success", "reward"}:
-            found[field.name] = replace(
-                field, role="left out", why=f"a second {field.role}: combine both into one field"
-            )
+            found[field.name] = replace(field, role="left out", why=f"a second {field.role}: combine both into one")
         elif field.role == "state" and not is_commanded and any(one.fullmatch(field.short) for one in ACTING):
             found[field.name] = replace(field, role="command", why=f"{field.why}, and no other command")
         seen.add(field.role)

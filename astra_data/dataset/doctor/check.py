@@ -124,15 +124,11 @@ def _info_faults(info: Mapping[str, Any], report: Report) -> list[plain.PlainCol
     }
     listed = features.items() if isinstance(features, dict) else ()
     checks |= {f"{name} is {one!r} in features, expected an object": isinstance(one, dict) for name, one in listed}
-    shapes = {
-        name: one.get("shape") for name, one in listed if isinstance(one, dict) and one.get("dtype") in plain.NUMBERS
-    }
-    checks |= {
-        f"{name} has the shape {shape!r}, expected whole numbers": (
-            isinstance(shape, list) and all(type(size) is int and size > 0 for size in shape)
-        )
-        for name, shape in shapes.items()
-    }
+    for name, one in listed:
+        if isinstance(one, dict) and one.get("dtype") in plain.NUMBERS:
+            shape = one.get("shape")
+            is_shape = isinstance(shape, list) and all(type(size) is int and size > 0 for size in shape)
+            checks[f"{name} has the shape {shape!r}, expected whole numbers"] = is_shape
     for fault in unmet(checks):
         report.fault(layout.INFO_PATH, f"{layout.INFO_PATH}: {fault}")
     if not isinstance(features, dict) or not all(list(checks.values())[1:]):

@@ -241,9 +241,7 @@ def remains_of(folder: Path, sources: Sequence[Dataset], notes: list[str]) -> Re
             notes.append(f"{error}: the origin is unknown")
     # A missing file is told where it is read.
     altered = [path for path in altered_files(folder, remains.old) if (folder / path).exists()]
-    notes += [
-        f"{path} was altered after it was written: {_IF_ALTERED[path]}" for path in altered if path in _IF_ALTERED
-    ]
+    notes += [f"{path} was altered after it was written: {why}" for path, why in _IF_ALTERED.items() if path in altered]
     try:
         remains.digests = read_digests(folder, [column.name for column in columns], altered)
     except CorruptDatasetError as error:

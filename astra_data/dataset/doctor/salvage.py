@@ -16,7 +16,7 @@ from astra_data.core.errors import CorruptDatasetError, in_short
 from astra_data.dataset import columns as names
 from astra_data.dataset import plain
 from astra_data.dataset.description import Digests, alteration
-from astra_data.dataset.format import INFO_PATH, UNREADABLE, arrow_type
+from astra_data.dataset.format import IMAGE, INFO_PATH, UNREADABLE, arrow_type
 
 _DICTIONARY, _DATA_V2 = 2, 3
 _FIELDS = {0: (5, 2), _DICTIONARY: (7, 2), _DATA_V2: (8, 4)}
@@ -25,7 +25,6 @@ _FIXED_WIDTH = (0, 9)  # encodings PLAIN and BYTE_STREAM_SPLIT
 _HEADER = 1000  # upper bound of a page header in bytes, including the extremes of its values
 _SNAPPY, _ZSTD, _ZSTD_MAGIC = 1, 6, b"\x28\xb5\x2f\xfd"
 _PIECES = 256  # of a row group that has rows which cannot be read
-_IMAGE = pa.struct({"bytes": pa.binary(), "path": pa.string()})
 TRUE, FALSE, BYTE, I16, I32, I64 = range(1, 7)
 BINARY, LIST, STRUCT = 8, 9, 12
 Columns = Sequence[plain.PlainColumn]
@@ -54,7 +53,7 @@ def whole_runs(
     features = listed if isinstance(listed := info.get("features"), Mapping) else {}
     stored = {column.name: arrow_type(column.dtype, column.size) for column in columns}
     pictured = (name for name, of in features.items() if isinstance(of, Mapping) and of.get("dtype") == "image")
-    stored = dict.fromkeys(pictured, _IMAGE) | stored
+    stored = dict.fromkeys(pictured, IMAGE) | stored
     schema = pa.schema([(name, stored[name]) for name in dict.fromkeys([*features, *stored]) if name in stored])
     episode = row = 0
     uids: set[int] = set()
@@ -195,8 +194,8 @@ def rebuilt_metadata(path: Path, schema: pa.Schema) -> pq.FileMetaData:
     """Return the metadata of all whole row groups of the parquet file at `path`, for `ParquetFile(metadata=...)`."""
     leaves: list[tuple[int, int]] = []  # values per row, and bits per value, 0 where these differ
     for field in schema:
-        if field.type == _IMAGE:
-            leaves += [(1, 0)] * _IMAGE.num_fields
+        if field.type == IMAGE:
+            leaves += [(1, 0)] * IMAGE.num_fields
             continue
         is_list = pa.types.is_fixed_size_list(field.type)
         value = field.type.value_type if is_list else field.type

@@ -72,9 +72,7 @@ class TargetRobot(gymnasium.Env[dict[str, Any], Array]):
         self.render_mode = "rgb_array"
         self._max_episode_steps = task.objective.horizon
         self._sizes = {STATE: task.state.size} | ({GOAL: goal} if (goal := task.objective.goal_size) else {})
-        boxes: dict[str, Space[Any]] = {
-            name: Box(-np.inf, np.inf, (size,), np.float32) for name, size in self._sizes.items()
-        }
+        boxes: dict[str, Space[Any]] = {name: Box(-np.inf, np.inf, (size,)) for name, size in self._sizes.items()}
         self.observation_space = Dict(boxes)
         self.action_space = Box(*np.array(list(task.limits.values()), np.float32).T)
 

@@ -25,17 +25,15 @@ class AstraDataPolicy(PreTrainedPolicy):  # type: ignore[misc]
     def __init__(self, config: AstraDataConfig, **_: object) -> None:
         """Read the folder `config.pretrained_path`."""
         super().__init__(config)
-        folder = config.pretrained_path
-        if folder is None or not (Path(folder) / DESCRIPTION).is_file():
-            raise BadInputError(
-                f"--policy.path: expected a folder that astra-data deploy wrote, got {folder or 'none'}"
-            )
+        path = config.pretrained_path
+        if path is None or not (Path(path) / DESCRIPTION).is_file():
+            raise BadInputError(f"--policy.path: expected a folder that astra-data deploy wrote, got {path or 'none'}")
         try:
-            described = intact(Path(folder), DESCRIPTION, ONNX)[0]
+            described = intact(path, DESCRIPTION, ONNX)[0]
         except ValueError as error:
             raise BadInputError(str(error)) from None
         self._about: dict[str, Any] = json.loads(described)
-        self._graph = load_onnx(Path(folder) / ONNX)
+        self._graph = load_onnx(Path(path) / ONNX)
         self.reset()
 
     @classmethod
