@@ -115,18 +115,13 @@ def main() -> None:
     try:
         app()
     except Exception as error:
-        reported = _reported(error)
+        reported: AstraDataError | None = error if isinstance(error, AstraDataError) else disk_error(error)
+        if isinstance(error, ModuleNotFoundError):
+            reported = missing_extra(error)
         if reported is None or os.environ.get("ASTRA_DATA_DEBUG"):
             raise
         typer.echo(f"error: {in_lines(str(reported))}", err=True)
         sys.exit(1)
-
-
-def _reported(error: Exception) -> AstraDataError | None:
-    """Return what to print of `error`; None if it is a fault of the program."""
-    if isinstance(error, ModuleNotFoundError):
-        return missing_extra(error)
-    return error if isinstance(error, AstraDataError) else disk_error(error)
 
 
 if __name__ == "__main__":

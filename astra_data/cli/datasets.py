@@ -92,8 +92,7 @@ def features(
     dataset: arguments.DatasetName,
     camera: Annotated[str, typer.Option(help="A camera, such as front for observation.images.front.")],
     encoder: Annotated[
-        str | None,
-        typer.Option(metavar="FILE.py:NAME", help="Your encoder; its code is run.", show_default="one of the package"),
+        str | None, typer.Option(metavar="FILE.py:NAME", help="Yours; its code is run.", show_default="the package's")
     ] = None,
     name: arguments.NewName = None,
     out: arguments.Out = None,
@@ -151,10 +150,8 @@ def inspect(
 
     maps = {("position", "m"): inspection.positions, ("velocity", "m/s"): inspection.velocities}
     if not any(maps.values()):
-        raise BadInputError(
-            f"{inspection.reference}: expected a state with the role position or vector, found none: "
-            "give its columns a role in the mapping, or leave out --plot"
-        )
+        advice = "give its columns a role in the mapping, or leave out --plot"
+        raise BadInputError(f"{found.reference}: expected a state with the role position or vector, got none: {advice}")
     for (label, unit), planar in maps.items():
         if planar:
             path = plot / f"{label}_coverage.png"
@@ -205,10 +202,8 @@ def _list_tasks() -> None:
         values = first_few(list(known.limits), 4), first_few(states, 4)
         table.add_row(shown, *values, "yes" if known.has_target else "no", str(known.fps))
     arguments.show_table(table)
-    typer.echo(
-        "`astra-data check TASK` tests one and shows all its values. Name your own task by its place: "
-        "cart.py:TASK or package.module:TASK. Its code is run."
-    )
+    own = "Name your own task by its place: cart.py:TASK or package.module:TASK. Its code is run."
+    typer.echo(f"`astra-data check TASK` tests one and shows all its values. {own}")
 
 
 def validate(

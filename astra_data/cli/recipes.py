@@ -28,8 +28,7 @@ def run(
     root: arguments.Root = RUNS,
     engine: Annotated[str, typer.Option(help="processes here, or ray: tasks of a Ray cluster.")] = "processes",
     address: Annotated[
-        str | None,
-        typer.Option(help="Of a Ray cluster, whose machines share this folder and installation.", show_default="here"),
+        str | None, typer.Option(help="Of a Ray cluster that shares this folder and installation.", show_default="here")
     ] = None,
 ) -> None:
     """Run all stages of a recipe; after an interruption, run it again to continue."""
@@ -183,12 +182,10 @@ def show_made(folder: Path, until: str | None) -> None:
 def select(
     run: arguments.RunFolder,
     row: Annotated[
-        list[str] | None,
-        typer.Option(metavar="ROW", help="Rank only policies of this row; may be repeated.", show_default="all"),
+        list[str] | None, typer.Option(metavar="ROW", help="Rank only this row; may be repeated.", show_default="all")
     ] = None,
     judge: Annotated[
-        str | None,
-        typer.Option(metavar="ROW", help="Its groundings are the judges.", show_default="nas, else the first with any"),
+        str | None, typer.Option(metavar="ROW", help="Its groundings judge.", show_default="nas, else the first")
     ] = None,
     episodes: Annotated[
         int | None, typer.Option(help="Episodes of each policy with each judge.", min=1, show_default="recipe's or 100")
@@ -300,8 +297,7 @@ def pair(
     jobs: arguments.Jobs = None,
     root: arguments.Root = RUNS,
     simulator: Annotated[
-        str | None,
-        typer.Option(help="A task, an installed simulator, or your own class: path.py:MySimulator. Its code is run."),
+        str | None, typer.Option(help="A task, an installed simulator, or yours: path.py:MySimulator. Its code is run.")
     ] = None,
     name: arguments.NewName = None,
     out: arguments.Out = None,
@@ -377,9 +373,9 @@ def new(
 
     places = [*(logs or ()), *(more or ())]
     if not places:
+        advice = "without any, begin with the files of `astra-data recipes copy cart`"
         raise BadInputError(
-            "expected the robot's logs, --from LOGS: CSV files, folders of them, or a dataset; without any, "
-            "begin with the files of `astra-data recipes copy cart`"
+            f"expected the robot's logs, --from LOGS: CSV files, folders of them or a dataset; {advice}"
         )
     folder = out or Path(name)
     simulator = write_robot(name, folder, places)

@@ -15,7 +15,7 @@ def import_(
     recordings: Annotated[list[Path], typer.Argument(metavar="SOURCE", help="Files, folders, archives: one format.")],
     mapping: Annotated[
         Path | None,
-        typer.Option(help="TOML file: which fields become which columns. D4RL, Minari and others need none."),
+        typer.Option(help="TOML file: which fields become which columns. D4RL, Minari and more need none."),
     ] = None,
     file_format: Annotated[
         str | None,
@@ -26,8 +26,7 @@ def import_(
     fps: Annotated[int | None, typer.Option(min=1, help="Steps per second.", show_default="the mapping's")] = None,
     task: Annotated[str | None, typer.Option(help="What the robot does in it.", show_default="the mapping's")] = None,
     max_bytes: Annotated[
-        int | None,
-        typer.Option(min=1, help="Refuse what unpacks to more bytes.", show_default="100 times their size, or 256 MB"),
+        int | None, typer.Option(min=1, help="Refuse what unpacks to more.", show_default="100-fold, or 256 MB")
     ] = None,
     skip_bad: Annotated[bool, typer.Option("--skip-bad", help="Leave out, and list, what cannot be imported.")] = False,
 ) -> None:

@@ -96,10 +96,8 @@ def continuity(counts: Mapping[int, tuple[int, int]]) -> list[Finding]:
     uids = tuple(uid for uid, (count, _) in counts.items() if count)
     broken, steps = (sum(each) for each in zip(*counts.values(), strict=True))
     what = f"steps whose {NEXT_STATE} is not the state of the next row: {broken} of {steps}"
-    advice = (
-        "rows are missing, or the columns come from different logs: import again, without "
-        f"{NEXT_STATE} in the mapping if each row is the state after the one before"
-    )
+    remedy = f"without {NEXT_STATE} in the mapping if each row is the state after the one before"
+    advice = f"rows are missing, or the columns come from different logs: import again, {remedy}"
     return [Finding("warning", what, advice, uids)] if uids else []
 
 
@@ -170,19 +168,15 @@ class Clock:
         if off := self._off(period_s):
             return f"{declared}, and {off} by {self.name}"
         missing = f" ({100 * share:.0f} % of the steps: rows are missing)" if share >= MANY_GAPS else ""
-        return (
-            f"{declared}, {1 / period_s:.4g} Hz by {self.name}; gaps within episodes: {gaps}{missing}, "
-            f"jitter {100 * jitter:.1f} % of a period"
-        )
+        found = f"gaps within episodes: {gaps}{missing}, jitter {100 * jitter:.1f} % of a period"
+        return f"{declared}, {1 / period_s:.4g} Hz by {self.name}; {found}"
 
     def findings(self, called: str) -> list[Finding]:
         """Tell a wrong rate, gaps, jitter, and where time stands still or goes back."""
         found, (period_s, gaps, share, jitter) = [], self.rates()
         if standing := [u for u, steps_s in zip(self.uids, self.steps_s, strict=True) if (steps_s <= 0).any()]:
-            remedy = (
-                "look for duplicate rows in the log or a clock that was set back, and in MCAP for an "
-                "`fps` that is too high or a topic that drops out (`gap_s`)"
-            )
+            of_mcap = "in MCAP for an `fps` that is too high or a topic that drops out (`gap_s`)"
+            remedy = f"look for duplicate rows in the log or a clock that was set back, and {of_mcap}"
             if not self.is_whole and float(np.spacing(np.float32(self.farthest_s))) * self.fps > _COARSE:
                 remedy = "store it as seconds since the start (`offset`) or as int64"
             what = f"{self.name} stands still or goes back between steps"
@@ -199,10 +193,9 @@ class Clock:
         if gaps:
             longest = [float(steps_s.max(initial=0.0)) for steps_s in self.steps_s]
             uids = [uid for uid, s in zip(self.uids, longest, strict=True) if s > GAP * period_s]
-            remedy = (
-                f"begin new episodes there (`time`, and `gap_s = {GAP * period_s:.3g}` in [split], of the "
-                f'mapping; for MCAP, `gap_s = {HELD * period_s:.3g}` in [columns."{self.name}"])'
-            )
+            of_mcap = f'for MCAP, `gap_s = {HELD * period_s:.3g}` in [columns."{self.name}"]'
+            split = f"`time`, and `gap_s = {GAP * period_s:.3g}` in [split], of the mapping"
+            remedy = f"begin new episodes there ({split}; {of_mcap})"
             # Many gaps are a recording of another rate, of which splits would leave crumbs.
             if share >= MANY_GAPS:
                 remedy = f"resample the recording (of MCAP, take an `fps` that divides its rate), or {remedy}"
@@ -322,10 +315,8 @@ def commands(column: Column, episodes: Iterable[Array], extremes: Floats, fps: i
     line = f"held {median_s:.3g} s (median), {long_s:.3g} s (95 %); steps at the edge of the range: {edges}"
     saturated = channels(column, np.flatnonzero(shares > SATURATED).tolist())
     what = f"commands at the edge of their range in up to {100 * shares.max():.0f} % of steps, {saturated}"
-    advice = (
-        "values in between are rarer in the data: compare the range with what the robot follows "
-        "(`clip` in the mapping), or record gentler commands"
-    )
+    remedy = "compare the range with what the robot follows (`clip` in the mapping), or record gentler commands"
+    advice = f"values in between are rarer in the data: {remedy}"
     return line, [Finding("note", what, advice)] if shares.max() > SATURATED else []
 
 
@@ -419,17 +410,11 @@ def endings(
         line = "unknown: neither success nor next.terminated was recorded"
     found, failures = [], [uid for uid, failure in zip(uids, failed, strict=True) if failure]
     if limit == 1:
-        advice = (
-            "check what ends them: failed of the robot or log, reached and missed of the objective, "
-            "or how a mapping splits episodes"
-        )
+        advice = "check what ends them: failed of the robot or log, reached and missed of the objective, or a mapping"
         found.append(Finding("warning", "every episode ends after its first step", advice))
     if 0 < len(failures) < FEW_FAILURES:
         count = "1 failure" if len(failures) == 1 else f"{len(failures)} failures"
-        advice = (
-            f"record {FEW_FAILURES} or more failures (astra-data collect TASK --behavior stress), or "
-            "no failure can be predicted from it"
-        )
+        advice = f"record {FEW_FAILURES} or more (astra-data collect TASK --behavior stress), or none can be predicted"
         what = f"{count}, which is little for a failure model to learn from"
         found.append(Finding("note", what, advice, tuple(failures)))
     return line, found
@@ -444,10 +429,8 @@ def repeated(state: Array) -> tuple[int, int]:
 def repeats(counts: Sequence[tuple[int, int]]) -> list[Finding]:
     """Tell where many rows are `repeated`, of the counts of each episode."""
     often, steps = (sum(each) for each in zip(*counts, strict=True))
-    what = (
-        f"{often} of {steps} steps repeat the state of the row before to the bit, between "
-        "steps that move: the log is faster than its sensor, or rows were written twice"
-    )
+    why = "the log is faster than its sensor, or rows were written twice"
+    what = f"{often} of {steps} steps repeat the state of the row before to the bit, between steps that move: {why}"
     advice = "leave out the repeated rows, correct `fps`, and import again"
     return [Finding("warning", what, advice)] if often > MOST_REPEATED * steps else []
 

@@ -138,10 +138,9 @@ class Column:
                 astra=astra or None,
             )
         except (AttributeError, LookupError, TypeError, ValueError) as error:
-            raise BadInputError(
-                f"Column {name!r}: meta/info.json has {feature!r:.200} in features, expected an object with dtype, "
-                "shape, names and astra."
-            ) from error
+            wanted = "expected an object with dtype, shape, names and astra."
+            found = f"meta/info.json has {feature!r:.200} in features"
+            raise BadInputError(f"Column {name!r}: {found}, {wanted}") from error
 
     def faults(self, values: Array) -> list[str]:
         """List how the dtype and shape of `values` differ from the column's; empty if they fit."""

@@ -161,11 +161,8 @@ def merge(
     if len(sources) < 2:
         raise BadInputError("expected two datasets or more to merge")
     first, *others = sources
-    faults = [
-        f"{other.reference}: {fault}"
-        for other in others
-        for fault in schema_differences(first, other, ("environment", "simulator"))
-    ]
+    also = ("environment", "simulator")
+    faults = [f"{other.reference}: {fault}" for other in others for fault in schema_differences(first, other, also)]
     if faults:
         expected = f"the columns, fps, environment and simulator of {first.reference} in all of them"
         faults += [_IMPORTED] if any(source.recorded for source in sources) else []
@@ -206,9 +203,8 @@ def trim(
     config = {"start_s": start_s, "end_s": end_s, "still": still, "without": without}
     if not (any(config.values()) and 0 <= start_s < np.inf and 0 <= end_s < np.inf):
         got = f"--start {start_s:g} and --end {end_s:g}" if start_s or end_s else "none"
-        raise BadInputError(
-            f"trim: expected a time of 0 s or more at the start or the end, --still or --without a condition, got {got}"
-        )
+        wanted = "expected a time of 0 s or more at the start or the end, --still or --without a condition"
+        raise BadInputError(f"trim: {wanted}, got {got}")
     condition = _condition(source, without) if without else None
     source.specs([names.STATE] if still else [])
     first, last = (round(seconds * source.info["fps"]) for seconds in (start_s, end_s))
@@ -245,10 +241,8 @@ def resample(source: Dataset, fps: int, *, name: str | None = None, out: Path | 
         rates = f"another rate than {source.info['fps']} per second, from 1 to {most}"
         raise BadInputError(f"resample: expected {rates}, got {fps}")
     if source.cameras and source.info["fps"] % fps:
-        raise BadInputError(
-            f"resample: {source.reference} has cameras, whose pictures are not interpolated: expected a rate that "
-            f"divides {source.info['fps']}, got {fps}"
-        )
+        wanted = f"expected a rate that divides {source.info['fps']}, got {fps}"
+        raise BadInputError(f"resample: {source.reference} has cameras, whose pictures are not interpolated: {wanted}")
     schema = [column for column in source.schema if not column.name.startswith("abstract.")]
     turns = {column.name: (column, _turns(column, source)) for column in schema}
     if {names.STATE, names.NEXT_STATE} <= turns.keys():  # next states are states, whatever is known of their own angles

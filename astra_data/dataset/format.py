@@ -98,15 +98,9 @@ def data_encodings(columns: Sequence[Column]) -> dict[str, str]:
 
 def episodes_schema(columns: Sequence[Column], cameras: Mapping[str, Mapping[str, Any]]) -> pa.Schema:
     """Return the Arrow schema of meta/episodes; `cameras` are the features of cameras."""
-    fields: list[tuple[str, pa.DataType]] = [
-        ("episode_index", pa.int64()),
-        ("tasks", pa.list_(pa.string())),
-        ("length", pa.int64()),
-        ("data/chunk_index", pa.int64()),
-        ("data/file_index", pa.int64()),
-        ("dataset_from_index", pa.int64()),
-        ("dataset_to_index", pa.int64()),
-    ]
+    places = ("length", "data/chunk_index", "data/file_index", "dataset_from_index", "dataset_to_index")
+    fields: list[tuple[str, pa.DataType]] = [("episode_index", pa.int64()), ("tasks", pa.list_(pa.string()))]
+    fields += [(name, pa.int64()) for name in places]
     for column in columns:
         for name in STORED_STATISTICS:
             value = pa.int64() if name == "count" else pa.float64()

@@ -85,10 +85,8 @@ class Batches:
         settings = {key: state.get(key) for key in self._settings}
         is_batch = type(epoch) is int and epoch >= 0 and type(batch) is int and 0 <= batch < len(self)
         if settings != self._settings or not is_batch:
-            raise BadInputError(
-                f"the state is of another order of samples: expected {self._settings} and a batch of 0 to "
-                f"{len(self) - 1}, got {state}"
-            )
+            wanted = f"expected {self._settings} and a batch of 0 to {len(self) - 1}, got {state}"
+            raise BadInputError(f"the state is of another order of samples: {wanted}")
         self.epoch, self.batch = state["epoch"], state["batch"]
 
 

@@ -216,10 +216,8 @@ def open_recording(root: Path) -> dict[str, Any]:
         raise CorruptDatasetError(f"{first_few(lost, MOST_FAULTS)} missing")
     stored, specs, fps = declared_columns(root, info)
     if missing := lacking(specs):
-        raise BadInputError(
-            f"{root}, recorded by LeRobot, has no {' and no '.join(missing)}: expected lists of numbers "
-            "for the state and the action, and one number for a reward or flag"
-        )
+        wanted = "expected lists of numbers for the state and the action, and one number for a reward or flag"
+        raise BadInputError(f"{root}, recorded by LeRobot, has no {' and no '.join(missing)}: {wanted}")
     rows = Rows({column.name: column for column in stored}, fps)
     columns = our_columns(specs, has_tasks=len(tasks) > 1)
     episodes, content_hash, digests = _survey(root, rows, columns, tasks, info)
@@ -328,18 +326,13 @@ def left_out(rows: Rows, episodes: Sequence[Found]) -> list[str]:
     """Say what is left out with the last rows of the episodes."""
     if not rows.dropped:
         return []
-    total = sum(episode.steps + rows.dropped for episode in episodes)
-    parts = [
-        f"next states are those of the following rows, which leaves out the last row of each episode, "
-        f"{len(episodes)} of {total} rows"
-    ]
+    share = f"{len(episodes)} of {sum(episode.steps + rows.dropped for episode in episodes)} rows"
+    parts = [f"next states are those of the following rows, which leaves out the last row of each episode, {share}"]
     if single := sum(not episode.steps for episode in episodes):
         parts.append(f"{single} of them in episodes of a single row")
     if lost := sum(episode.lost_success for episode in episodes):
-        parts.append(
-            f"{lost} of these last rows are the only ones that succeeded, so {names.SUCCESS} is lost unless "
-            f"{names.DONE} or {names.TERMINATED} is set there"
-        )
+        which = f"so {names.SUCCESS} is lost unless {names.DONE} or {names.TERMINATED} is set there"
+        parts.append(f"{lost} of these last rows are the only ones that succeeded, {which}")
     if reward := sum(episode.lost_reward for episode in episodes):
         parts.append(f"with the last rows a reward of {reward:g} in sum is left out")
     return parts
@@ -349,10 +342,9 @@ def _announce(root: Path, rows: Rows, columns: Sequence[Column], episodes: Seque
     """Say in one line what is left out or rounded, and which ends are not those of episodes, and `more`."""
     parts = left_out(rows, episodes)
     if early := [episode.uid for episode in episodes if episode.is_done_early]:
-        parts.append(
-            f"{names.DONE} is set before the last row of {len(early)} episodes ({first_few(early, MOST_FAULTS)}), "
-            "which go on there: an import of the files can end them (`ends` in [split] of a mapping)"
-        )
+        which = f"{len(early)} episodes ({first_few(early, MOST_FAULTS)})"
+        advice = "an import of the files can end them (`ends` in [split] of a mapping)"
+        parts.append(f"{names.DONE} is set before the last row of {which}, which go on there: {advice}")
     for column in columns:
         stored = rows.stored.get(column.name)
         if stored and not np.can_cast(stored.dtype, column.dtype):

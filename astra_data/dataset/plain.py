@@ -25,11 +25,8 @@ NUMBERS = ("bool", "float16", "float32", "float64", *(f"{u}int{bits}" for u in (
 _END_FLAGS = (names.TERMINATED, names.TRUNCATED, names.DONE)
 _DATA_PATH = re.compile(r"([\w./ -]|\{(chunk|file)_index(:0?\d{1,2}d)?\})+")
 _LOCATION = ("episode_index", "length", "dataset_from_index", "data/chunk_index", "data/file_index")
-_FORMAT_2 = {
-    "tasks": "meta/tasks.jsonl",
-    "episodes": "meta/episodes.jsonl",
-    "data": "data/chunk-{:03d}/episode_{:06d}.parquet",
-}  # files of LeRobot's formats 2.0 and 2.1: one of the data for each episode
+_FORMAT_2 = {"tasks": "meta/tasks.jsonl", "episodes": "meta/episodes.jsonl"}  # files of LeRobot's formats 2.0 and 2.1
+_FORMAT_2_DATA = "data/chunk-{:03d}/episode_{:06d}.parquet"  # likewise, one for each episode
 PLAIN_STATISTICS = ("min", "max", "mean", "std", "count")  # those that every file of the format has of every column
 _MOST_ROWS = 10**12
 _MOST_BYTES = 2**28  # of a file of metadata in JSON
@@ -115,7 +112,7 @@ def read_places(root: Path, info: Mapping[str, Any]) -> tuple[dict[int, Place], 
             number, length = (_whole(row.get(key)) for key in ("episode_index", "length"))
             if number is None or length is None:
                 return places, [f"{_FORMAT_2['episodes']} has no whole numbers as episode_index and length"]
-            places[number] = Place(length, first, root / _FORMAT_2["data"].format(number // chunks, number))
+            places[number] = Place(length, first, root / _FORMAT_2_DATA.format(number // chunks, number))
             first += length
         return places, []
     pattern = str(info.get("data_path")) if is_data_path(info.get("data_path")) else None
@@ -126,8 +123,8 @@ def read_places(root: Path, info: Mapping[str, Any]) -> tuple[dict[int, Place], 
                 number, length, start, chunk, file = (fact if type(fact) is int else None for fact in facts)
                 if number is None or length is None:
                     raise CorruptDatasetError(f"{path.name} has no whole episode_index or length")
-                located = pattern and chunk is not None and file is not None
-                inside = root / pattern.format(chunk_index=chunk, file_index=file) if pattern and located else None
+                located = pattern if None not in (chunk, file) else None
+                inside = root / located.format(chunk_index=chunk, file_index=file) if located else None
                 places[number] = Place(length, start, inside)
         except (*UNREADABLE, CorruptDatasetError) as error:
             faults.append(f"{path.name}: {in_short(error)}")

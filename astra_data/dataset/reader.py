@@ -407,14 +407,11 @@ def refuse_others(root: Path) -> None:
     refuse_folders(root)
     fault = format_fault(root)
     if not fault and not (root / "meta").is_dir():
-        logs = sorted(path.name for path in root.glob("*.[cC][sS][vV]"))
-        fault = (
-            f"{root} contains logs ({logs[0]} and so on): make them a dataset with `astra-data import` and a "
-            "mapping, which `astra-data new` writes"
-            if logs
-            else f"{root}: found no dataset; check the path (`astra-data list` shows where names are) or run the "
-            "stage that writes it."
-        )
+        advice = "check the path (`astra-data list` shows where names are) or run the stage that writes it."
+        fault = f"{root}: found no dataset; {advice}"
+        if logs := sorted(path.name for path in root.glob("*.[cC][sS][vV]")):
+            advice = "make them a dataset with `astra-data import` and a mapping, which `astra-data new` writes"
+            fault = f"{root} contains logs ({logs[0]} and so on): {advice}"
     if fault:
         raise BadInputError(fault)
 
@@ -451,8 +448,6 @@ def explained(root: Path) -> Iterator[None]:
         yield
     except (CorruptDatasetError, KeyError) as error:
         fault = f"{error} is missing in its metadata" if isinstance(error, KeyError) else error
-        advice = (
-            "Restore it from a copy, run the stage that wrote it again, or recover its intact episodes: "
-            f"`astra-data repair {root} --out FOLDER`."
-        )
+        repair = f"`astra-data repair {root} --out FOLDER`."
+        advice = f"Restore it from a copy, run the stage that wrote it again, or recover its intact episodes: {repair}"
         raise CorruptDatasetError(f"{root} is incomplete or was altered: {fault}. {advice}") from error

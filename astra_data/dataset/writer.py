@@ -106,6 +106,7 @@ class DatasetWriter:
         self._admission = Admission(columns, self._cameras)
         self._exit = ExitStack()
         self._is_open = False
+        self._clips: dict[str, ClipWriter] = {}
 
     @property
     def content_hash(self) -> str:
@@ -120,13 +121,10 @@ class DatasetWriter:
             self._data = layout.RotatingWriter(self._folder, layout.DATA_PATH, self._schema, encodings, "snappy")
             stack.callback(self._data.abandon)
             self._rows = EpisodeRows(self._folder, self._stored, self._task, self._cameras)
-            self._clips = {
-                name: ClipWriter(self._folder, name, self._fps)
-                for name, feature in self._cameras.items()
-                if feature["dtype"] == "video"
-            }
-            for clips in self._clips.values():
-                stack.callback(clips.close)
+            for name, feature in self._cameras.items():
+                if feature["dtype"] == "video":
+                    self._clips[name] = ClipWriter(self._folder, name, self._fps)
+                    stack.callback(self._clips[name].close)
             stack.callback(self._rows.file.abandon)
             self._exit = stack.pop_all()
         self._is_open = True
@@ -329,10 +327,8 @@ class StagedWriter:
 
     def __enter__(self) -> "StagedWriter":
         if self._holds_work() and not self._resume and not self.root.exists():
-            raise BadInputError(
-                f"{self.root}: an interrupted recording left {self._left()}; "
-                f"resume it (--resume), or delete {self.folder} to start again."
-            )
+            advice = f"resume it (--resume), or delete {self.folder} to start again."
+            raise BadInputError(f"{self.root}: an interrupted recording left {self._left()}; {advice}")
         with durable.writing(self.folder), ExitStack() as stack:
             stack.callback(durable.remove_empty, durable.make_folder(self.folder))
             durable.sweep(self.root)
@@ -441,15 +437,11 @@ class StagedWriter:
         before = read_object(self.folder / _SETTINGS)
         if isinstance(before, dict):
             if differing := ", ".join(key for key, *_ in described.changed_values(before, self._settings)):
-                raise BadInputError(
-                    f"{self.root}: the interrupted recording differs in {differing}; "
-                    f"resume it with the same settings, or delete {self.folder}."
-                )
+                advice = f"resume it with the same settings, or delete {self.folder}."
+                raise BadInputError(f"{self.root}: the interrupted recording differs in {differing}; {advice}")
         elif self._holds_work():
-            raise BadInputError(
-                f"{self.folder} holds {self._left()}, but {_SETTINGS} {before}, so that nobody knows "
-                f"of which recording: delete the folder to start again."
-            )
+            advice = "so that nobody knows of which recording: delete the folder to start again."
+            raise BadInputError(f"{self.folder} holds {self._left()}, but {_SETTINGS} {before}, {advice}")
         else:
             durable.write_file(self.folder / _SETTINGS, json.dumps(self._settings, indent=1, sort_keys=True))
 
@@ -469,6 +461,7 @@ def write_staged(path: Path, episode: Episode, schema: pa.Schema) -> None:
 
 def load_staged(path: Path, columns: Sequence[Column]) -> Episode:
     """Return the episode in the file at `path`."""
+    advice = "delete it and resume the recording."
     try:
         if not path.is_file():
             raise OSError("it is no file")
@@ -479,9 +472,7 @@ def load_staged(path: Path, columns: Sequence[Column]) -> Episode:
             uid, metadata, digests = facts["uid"], facts["metadata"], facts["digests"]
             altered = [name for name, digest in digests.items() if described.digest_of(values[name]) != digest]
     except (OSError, pa.ArrowException, AttributeError, KeyError, TypeError, ValueError) as error:
-        raise CorruptDatasetError(
-            f"{path} is no whole episode ({in_short(error)}); delete it and resume the recording."
-        ) from error
+        raise CorruptDatasetError(f"{path} is no whole episode ({in_short(error)}); {advice}") from error
     if altered:
-        raise CorruptDatasetError(f"{path} was altered in {', '.join(altered)}; delete it and resume the recording.")
+        raise CorruptDatasetError(f"{path} was altered in {', '.join(altered)}; {advice}")
     return Episode(uid, values, metadata)

@@ -49,10 +49,8 @@ def deploy(run: Path, row: str, out: Path, *, seed: int = 0, percent: int | None
     trained = trained_policy(run, row, seed=seed, percent=percent)
     deployed = trained.running()
     if deployed.sensing is not None:
-        raise BadInputError(
-            f"{row} acts on {', '.join(deployed.sensing.inputs)} in place of states, which a folder does not: act with "
-            "astra_data.load_policy, or align without inputs"
-        )
+        advice = "which a folder does not: act with astra_data.load_policy, or align without inputs"
+        raise BadInputError(f"{row} acts on {', '.join(deployed.sensing.inputs)} in place of states, {advice}")
     from astra_data.deployment.graph import write_graph
 
     digests = {stage: file_digest(path) for stage, path in trained.files.items()}

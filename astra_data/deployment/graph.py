@@ -57,10 +57,8 @@ def write_graph(deployed: RunningPolicy, folder: Path) -> tuple[dict[str, int], 
     """Write the policy as ONNX; return the sizes of its hidden state's parts, and how many half ranges it differs."""
     optional("onnxscript")
     if isinstance(deployed.policy, UserPolicy):
-        raise BadInputError(
-            f"{deployed.policy.name} is a policy of another learner, which cannot be traced: export it with "
-            "its own library, or act with astra_data.load_policy"
-        )
+        advice = "export it with its own library, or act with astra_data.load_policy"
+        raise BadInputError(f"{deployed.policy.name} is a policy of another learner, which cannot be traced: {advice}")
     graph = PolicyGraph(deployed).eval()
     with warnings.catch_warnings(), torch.no_grad():
         warnings.simplefilter("ignore")  # of torch's exporters, about torch's own code
@@ -122,11 +120,9 @@ def _not_traceable(deployed: RunningPolicy, error: Exception) -> BadInputError:
             break
     while cause.__cause__ is not None:
         cause = cause.__cause__  # type: ignore[assignment]
-    reason = next(iter(str(cause).strip().splitlines()), "")
-    return BadInputError(
-        f"{task.name}: {name} cannot be written as a graph ({type(cause).__name__}: {reason}): expected "
-        "operations of torch alone, and no branch that depends on values"
-    )
+    reason = f"{type(cause).__name__}: {next(iter(str(cause).strip().splitlines()), '')}"
+    wanted = "expected operations of torch alone, and no branch that depends on values"
+    return BadInputError(f"{task.name}: {name} cannot be written as a graph ({reason}): {wanted}")
 
 
 def _apart(graph: PolicyGraph, written: Graph) -> float:

@@ -78,10 +78,8 @@ def refuse_far(state: Any, about: dict[str, Any]) -> None:  # noqa: ANN401 - an 
     far = np.maximum(least - state, state - largest) > FAR * width
     for index in np.flatnonzero(far & (width > 0)):
         unit = f" {about['units'][index]}" if "units" in about else ""
-        raise ValueError(
-            f"state: {about['names'][index]} is {state[index]:g}, recorded is {least[index]:g} to "
-            f"{largest[index]:g}{unit}: give it in that unit"
-        )
+        usual = f"recorded is {least[index]:g} to {largest[index]:g}{unit}: give it in that unit"
+        raise ValueError(f"state: {about['names'][index]} is {state[index]:g}, {usual}")
 
 
 def finite(called: str, given: Any, names: Sequence[str]) -> Any:  # noqa: ANN401 - anything like an array

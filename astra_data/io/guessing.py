@@ -128,10 +128,8 @@ class Logs:
         if not self.of("time"):
             return f"the logs have no time in numbers: {self.rate} rows per second are assumed; set fps, TIMESTEP_S"
         error = self.recorded_rate / self.rate - 1
-        warning = (
-            f"the logs have {self.recorded_rate:.4g} rows per second, not a whole number: TIMESTEP_S is "
-            f"{abs(error):.1%} too {'long' if error > 0 else 'short'}; resample them to {self.rate} rows per second"
-        )
+        off = f"{abs(error):.1%} too {'long' if error > 0 else 'short'}; resample them to {self.rate} rows per second"
+        warning = f"the logs have {self.recorded_rate:.4g} rows per second, not a whole number: TIMESTEP_S is {off}"
         return warning if abs(error) >= _EVEN else ""
 
     @property
@@ -196,10 +194,8 @@ def _check_rates(sources: Sequence[Source], steps_s: Sequence[Floats]) -> None:
     usual = sorted(rates)[len(rates) // 2]
     for source, rate in zip(sources, rates, strict=True):
         if rate and usual and abs(rate / usual - 1) > RATE_TOLERANCE:
-            raise BadInputError(
-                f"{source.path}: expected {usual:.4g} rows per second, as in other files, got {rate:.4g}: "
-                "leave it out, or resample it"
-            )
+            advice = f"as in other files, got {rate:.4g}: leave it out, or resample it"
+            raise BadInputError(f"{source.path}: expected {usual:.4g} rows per second, {advice}")
 
 
 def _episodes(table: dict[str, Floats]) -> list[dict[str, Floats]]:

@@ -12,15 +12,8 @@ import numpy as np
 from astra_data.core.errors import BadInputError, optional
 from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED
 
-D4RL = {
-    STATE: "observations",
-    ACTION: "actions",
-    REWARD: "rewards",
-    TERMINATED: "terminals",
-    TRUNCATED: "timeouts",
-    NEXT_STATE: "next_observations",
-    GOAL: "infos/goal",
-}
+D4RL = {STATE: "observations", ACTION: "actions", REWARD: "rewards", TERMINATED: "terminals", TRUNCATED: "timeouts"}
+D4RL |= {NEXT_STATE: "next_observations", GOAL: "infos/goal"}
 ROBOMIMIC = {ACTION: "actions", REWARD: "rewards", TERMINATED: "dones", TRUNCATED: "truncated"}
 """Per demonstration; its learners take `dones` for terminated, and `truncated` is ours."""
 D3RLPY = {STATE: "observations", ACTION: "actions", REWARD: "rewards", TERMINATED: "terminated"}

@@ -138,11 +138,9 @@ def import_dataset(
             raise BadInputError("\n".join(bad))
         _refuse_rejected(cutter)
         faults = f" ({tally.faults})" if tally.not_finite else ""
-        raise BadInputError(
-            f"{', '.join(map(str, recordings))}: no episodes, {_why_none(cutter)} (rows {tally.rows}, "
-            f"rejected {tally.rejected_rows}{faults}, last ones without a next state {tally.last_rows}, in episodes "
-            f"that were too short {tally.short_rows})"
-        )
+        lost = f"last ones without a next state {tally.last_rows}, in episodes that were too short {tally.short_rows}"
+        counts = f"(rows {tally.rows}, rejected {tally.rejected_rows}{faults}, {lost})"
+        raise BadInputError(f"{', '.join(map(str, recordings))}: no episodes, {_why_none(cutter)} {counts}")
     description = {
         "name": settings.name,
         "version": settings.version,

@@ -29,11 +29,9 @@ ZARR = (".zgroup", ".zarray", ".zattrs", "zarr.json")
 FOREIGN = {
     (".npy",): "a NumPy array without a name: save it beside others under names, numpy.savez('log.npz', "
     "state=..., action=...), and import that",
-    (".db3", ".db3.zstd"): "a bag of ROS 2 in SQLite, expected MCAP: write `output_bags: [{uri: NEW, "
-    "storage_id: mcap, all: true}]` to a file new.yaml, run `ros2 bag convert -i BAG -o new.yaml`, and "
-    "import NEW",
-    (".gz", ".bz2", ".xz", ".zst", ".zstd", ".zip", ".7z"): "compressed: unpack it (gunzip, bunzip2, unxz, "
-    "unzstd, unzip)",
+    (".db3", ".db3.zstd"): "a bag of ROS 2 in SQLite, expected MCAP: write `output_bags: [{uri: NEW, storage_id: "
+    "mcap, all: true}]` to a file new.yaml, run `ros2 bag convert -i BAG -o new.yaml`, and import NEW",
+    (".gz", ".bz2", ".xz", ".zst", ".zstd", ".zip", ".7z"): "compressed: unpack it (gunzip, bunzip2, unxz, unzstd, 7z)",
     (".bag",): "a bag of ROS 1: run `uvx --from rosbags rosbags-convert --src FILE --dst NEW --dst-storage "
     "mcap`, and import NEW with a mapping like recipes/imports/ros2_base.toml",
     (".ulg",): "a log of PX4: run `uvx --from pyulog ulog2csv FILE`, and import the folder of its CSVs, "
@@ -134,10 +132,8 @@ class Block:
 def foreign(names: Sequence[str]) -> str:
     """Say what files of these names are and how to import what they hold; nothing where that is not known."""
     if any(".tfrecord" in name.lower() for name in names):
-        return (
-            "RLDS (TensorFlow Datasets): load it with tensorflow_datasets, and save each episode's steps by "
-            "numpy.savez('0.npz', state=..., action=..., reward=...), then import the folder"
-        )
+        advice = "by numpy.savez('0.npz', state=..., action=..., reward=...), then import the folder"
+        return f"RLDS (TensorFlow Datasets): load it with tensorflow_datasets, and save each episode's steps {advice}"
     plain = [name for name in names if not is_archive(Path(name))]
     found = ((name, advice) for name in plain for ends, advice in FOREIGN.items() if name.lower().endswith(ends))
     return next((f"{PurePosixPath(name).name} is {advice}" for name, advice in found), "")
@@ -246,10 +242,8 @@ def refuse_dataset(place: Path) -> None:
     """Raise BadInputError if a folder is a dataset already, ours or one that LeRobot recorded."""
     info = read_object(place / INFO_PATH)
     if isinstance(info, dict) and "codebase_version" in info:
-        raise BadInputError(
-            f"{place} is a LeRobot dataset, not logs, and needs no import: use it directly, as in "
-            f"`astra-data inspect {shlex.quote(str(place))}`, or as `data` in a recipe"
-        )
+        advice = f"use it directly, as in `astra-data inspect {shlex.quote(str(place))}`, or as `data` in a recipe"
+        raise BadInputError(f"{place} is a LeRobot dataset, not logs, and needs no import: {advice}")
 
 
 def is_archive(path: Path) -> bool:

@@ -94,10 +94,9 @@ class Resampler:
         """Yield what ended episodes: each topic that was silent alone, and what to do if it should not."""
         for topic, times in self.silences.items():
             key = "gap_s of its column" if topic in self._has_own_gap else "split.gap_s"
-            note = (
-                f"{self._origin}: {topic} is silent for over {self._gap_ns[topic] / 1e9:g} s ({key}) {times} "
-                "times while others are not; episodes end there"
-            )
+            longest = f"{self._gap_ns[topic] / 1e9:g} s ({key})"
+            often = f"is silent for over {longest} {times} times while others are not"
+            note = f"{self._origin}: {topic} {often}; episodes end there"
             if command := self._commands.get(topic):
                 yield (
                     f"{note}. That is right if the robot stops by itself without commands; if it continues "
@@ -116,11 +115,9 @@ class Resampler:
             elif self._repeated[topic] > MOST_UNEVEN * self._rows or (
                 topic in self._lossy and self._skipped[topic] > MOST_UNEVEN * self._messages[topic]
             ):
-                notes.append(
-                    f"{topic} comes {rate:.4g} times a second, fps is {self._fps}: {self._repeated[topic]} "
-                    f"of {self._rows} rows repeat its message before, {self._skipped[topic]} of "
-                    f"{self._messages[topic]} messages are in no row"
-                )
+                repeated = f"{self._repeated[topic]} of {self._rows} rows repeat its message before"
+                lost = f"{self._skipped[topic]} of {self._messages[topic]} messages are in no row"
+                notes.append(f"{topic} comes {rate:.4g} times a second, fps is {self._fps}: {repeated}, {lost}")
         return tuple(f"{self._origin}: {note}" for note in notes)
 
     def _sampled(self, time: int) -> Iterator[tuple[bool, dict[str, Any]]]:
@@ -223,7 +220,5 @@ def uneven_steps(topic: str, rate: float, fps: int) -> str:
     near = range(math.ceil(fps / _NEAR), min(_NEAR * fps, whole) + 1)
     even = sorted((each for each in near if rate % each == 0), key=lambda each: abs(math.log(each / fps)))
     best = even[:3] or [min(near, key=lambda each: abs(rate / each - round(rate / each)))]
-    return (
-        f"{topic} comes {rate:.4g} times a second, of which {fps} fps is no whole fraction: steps of {short} "
-        f"and {long} ms alternate; take {' or '.join(map(str, sorted(best)))}"
-    )
+    advice = f"steps of {short} and {long} ms alternate; take {' or '.join(map(str, sorted(best)))}"
+    return f"{topic} comes {rate:.4g} times a second, of which {fps} fps is no whole fraction: {advice}"

@@ -272,12 +272,9 @@ class EpisodeChecks:
         place = {key: row.get(f"data/{key}") for key in ("chunk_index", "file_index")}
         known = all(isinstance(index, int) for index in place.values())
         present = {self.tasks.get(int(task)) for task in np.unique(run.columns[names.TASK_INDEX])}
-        compared: dict[str, tuple[object, object]] = {
-            "episode_index": (row.get("episode_index"), number),
-            "length": (row.get("length"), len(run)),
-            "dataset_from_index": (row.get("dataset_from_index"), start),
-            "dataset_to_index": (row.get("dataset_to_index"), start + len(run)),
-        }
+        wanted = {"episode_index": number, "length": len(run)}
+        wanted |= {"dataset_from_index": start, "dataset_to_index": start + len(run)}
+        compared: dict[str, tuple[object, object]] = {key: (row.get(key), value) for key, value in wanted.items()}
         named, listed = self.info["data_path"].format(**place) if known else None, row.get("tasks")
         compared["the file"] = (named, run.path.as_posix().removeprefix(f"{self.root.as_posix()}/"))
         if not isinstance(listed, list) or set(map(str, listed)) != set(map(str, present)):

@@ -128,10 +128,8 @@ def pull(
         names = place.names()[:MOST_NAMED] if isinstance(place, stores.UrlStore) else []
         if inside := [f"{place}/{one}" for one in names if stores.UrlStore(f"{place}/{one}").versions()]:
             raise BadInputError(f"{place} is a folder of datasets: pull one of {', '.join(inside)}")
-        raise SharingError(
-            f"{place} has no dataset of astra-data: no tag or folder such as data-1.2.0. "
-            "A plain LeRobot dataset is opened with lerobot; otherwise check the spelling."
-        )
+        advice = "A plain LeRobot dataset is opened with lerobot; otherwise check the spelling."
+        raise SharingError(f"{place} has no dataset of astra-data: no tag or folder such as data-1.2.0. {advice}")
     if asked and asked not in known:
         listed = ", ".join(one.tag for one in known)
         raise BadInputError(f"{place} has no version {asked.tag}; it has {listed}.")

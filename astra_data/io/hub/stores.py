@@ -85,10 +85,8 @@ def parse_place(text: str) -> "HubStore | UrlStore":
     if text.startswith(("/", "./", "../", "~/")):
         return UrlStore(f"file://{Path(text).expanduser().absolute()}")
     if not _URL.fullmatch(text) or text.startswith("hf://"):
-        raise BadInputError(
-            f"{text}: expected user/name or hf://datasets/user/name for the Hugging Face Hub, "
-            "a URL such as s3://bucket/folder or gs://bucket/folder, or a folder such as ./shared or /shared"
-        )
+        others = "a URL such as s3://bucket/folder or gs://bucket/folder, or a folder such as ./shared or /shared"
+        raise BadInputError(f"{text}: expected user/name or hf://datasets/user/name for the Hugging Face Hub, {others}")
     return UrlStore(text.rstrip("/"))
 
 
@@ -205,10 +203,8 @@ class HubStore:
             if name != dataset.description["name"]:
                 raise BadInputError(f"{self.repo} holds the dataset {name!r}; choose another repository.")
             if known[-1] > version:
-                raise BadInputError(
-                    f"{self.repo} has {known[-1].tag} already, and main shows the newest version: "
-                    f"{version.tag} can no longer be added. Push it to another place."
-                )
+                why = f"main shows the newest version: {version.tag} can no longer be added. Push it to another place."
+                raise BadInputError(f"{self.repo} has {known[-1].tag} already, and {why}")
         with self._api() as api:
             progress(0.0, "files")
             # If somebody else commits from here on, this commit fails.
@@ -351,15 +347,12 @@ def explained(place: str) -> Iterator[None]:
     except PermissionError as error:
         raise SharingError(f"{place}: no rights to do this ({error}); check the credentials.") from error
     except (FileNotFoundError, NotADirectoryError) as error:
-        raise SharingError(
-            f"{place}: does not exist or is no folder ({error}); check the spelling, or delete a version "
-            "whose files are missing and push it again."
-        ) from error
+        advice = "check the spelling, or delete a version whose files are missing and push it again."
+        raise SharingError(f"{place}: does not exist or is no folder ({error}); {advice}") from error
     except Exception as error:
-        raise (_of_the_hub(place, error) if "Hugging Face Hub" in place else None) or SharingError(
-            f"{place}: {type(error).__name__}: {error}; check the address, the credentials and the network, "
-            "then run the same command again."
-        ) from error
+        advice = "check the address, the credentials and the network, then run the same command again."
+        other = SharingError(f"{place}: {type(error).__name__}: {error}; {advice}")
+        raise (_of_the_hub(place, error) if "Hugging Face Hub" in place else None) or other from error
 
 
 def _of_the_hub(place: str, error: Exception) -> AstraDataError | None:

@@ -51,10 +51,8 @@ def whole_lines(source: Source, name: str) -> tuple[bytes, bool]:
     # Of pandas, columns without names are called 0, 1, 2, ...
     if cells != [str(number) for number in range(len(cells))] and all(map(_NUMBER.fullmatch, cells)):
         names = delimiter.join(f"f{number}" for number in range(len(cells)))
-        raise BadInputError(
-            f"{name}: expected a header with a name for each field, got numbers: write one above the first "
-            f"line, such as {shortened(names, _SHOWN)} (sed -i '1i NAMES' FILE)"
-        )
+        advice = f"write one above the first line, such as {shortened(names, _SHOWN)} (sed -i '1i NAMES' FILE)"
+        raise BadInputError(f"{name}: expected a header with a name for each field, got numbers: {advice}")
     if delimiter not in first and (others := [other for part, other in _MARKS.items() if part in first]):
         raise BadInputError(
             f"{name}: expected fields parted by {_MARKS[delimiter]}, got {others[0]} in its header: "
@@ -85,10 +83,8 @@ def explained(name: str, source: Source) -> Iterator[None]:
                     advice = "write as many fields there as in the header, or leave the line out"
                     if len(header) == 1 or header[0].startswith("#"):
                         advice = f"leave out what is above the header, {shortened(repr(header[0]), _SHOWN)}"
-                    raise BadInputError(
-                        f"{name} cannot be read as csv: line {number}: Expected {len(header)} columns, got "
-                        f"{len(cells)}: {advice}"
-                    ) from None
+                    fault = f"Expected {len(header)} columns, got {len(cells)}: {advice}"
+                    raise BadInputError(f"{name} cannot be read as csv: line {number}: {fault}") from None
         advice = "leave it out" if "Empty" in str(error) else _SAVE
         raise BadInputError(f"{name}: expected CSV with a header ({in_short(error)}): {advice}") from None
 
@@ -242,8 +238,6 @@ def numbers_of(texts: pa.StringArray, source: Source, field: str) -> Array:
         except ValueError:
             rows.append([])
         if not rows[-1] or len(rows[-1]) != len(rows[0]):
-            raise BadInputError(
-                f"{source} line {line_of(source, row)}: field '{field}': expected a list of "
-                f"{len(rows[0]) or 'some'} numbers as in the rows before, got '{shortened(str(texts[row]), _SHOWN)}'"
-            )
+            got = f"{len(rows[0]) or 'some'} numbers as in the rows before, got '{shortened(str(texts[row]), _SHOWN)}'"
+            raise BadInputError(f"{source} line {line_of(source, row)}: field '{field}': expected a list of {got}")
     return np.array(rows)

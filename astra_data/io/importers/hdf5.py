@@ -35,10 +35,8 @@ def _blocks(
     whole = [group for group in groups if all(f"{group}/{field}" in stored for field in wanted)]
     if mapping.episodes is None and whole and not stored & set(wanted):
         pattern = re.sub("[0-9]+", "*", first := min(whole, key=natural))
-        raise BadInputError(
-            f"{origin}: the fields are in {len(whole)} groups, such as {first}: give the mapping episodes = "
-            f'"{pattern}", and each is an episode'
-        )
+        advice = f'give the mapping episodes = "{pattern}", and each is an episode'
+        raise BadInputError(f"{origin}: the fields are in {len(whole)} groups, such as {first}: {advice}")
     order = slice(None, None, -1 if mapping.transposed else 1)
     shapes = {name: (dataset.shape or ())[order] for name, dataset in datasets.items()}
     single = {name: datasets[name] for name, shape in shapes.items() if not shape} | attributes
@@ -86,10 +84,8 @@ def layout(source: Source) -> dict[str, Any]:
             return {"columns": columns, "episodes": NUMBERED}
         demos = sorted({name.split("/")[1] for name in fields if name.startswith("data/demo_")}, key=natural)
         if not demos:
-            raise BadInputError(
-                f"{source}: neither D4RL's layout (observations, actions) nor d3rlpy's (observations_0) nor "
-                "robomimic's (data/demo_0); pass --mapping"
-            )
+            others = "nor d3rlpy's (observations_0) nor robomimic's (data/demo_0); pass --mapping"
+            raise BadInputError(f"{source}: neither D4RL's layout (observations, actions) {others}")
         demo = stored_datasets(file[f"data/{demos[0]}"])
         columns = {name: {"fields": [field]} for name, field in ROBOMIMIC.items() if field in demo}
         commands = [field for field in demo if field.startswith("obs/") and _COMMANDS.search(field)]
@@ -98,10 +94,9 @@ def layout(source: Source) -> dict[str, Any]:
             if found := sorted(field for field in rows if not _COMMANDS.search(field)):
                 columns[name] = {"fields": found, "names": _labels(demo, found)}
         if STATE not in columns:
-            raise BadInputError(
-                f"{source}: data/{demos[0]} has no obs of numbers, which are the state (its fields: "
-                f"{', '.join(demo)}): run robomimic's dataset_states_to_obs.py, or map states by --mapping"
-            )
+            advice = "run robomimic's dataset_states_to_obs.py, or map states by --mapping"
+            has = f"has no obs of numbers, which are the state (its fields: {', '.join(demo)})"
+            raise BadInputError(f"{source}: data/{demos[0]} {has}: {advice}")
         keys: dict[str, Any] = {"columns": columns, "episodes": "data/demo_*"}
         if commands:
             keys["remark"] = f"without {', '.join(commands)}, which would show a policy the command to find"

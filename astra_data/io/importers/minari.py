@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from astra_data.core.errors import BadInputError, optional
-from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED, Array
-from astra_data.io.hdf5_file import check_storage, refuse_links, stored_datasets, unpacked_bytes
+from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, STATE, Array
+from astra_data.io.hdf5_file import MINARI, check_storage, refuse_links, stored_datasets, unpacked_bytes
 from astra_data.io.mapping import ImportMapping
 from astra_data.io.recording import Block, Source, row_count
 
@@ -42,14 +42,9 @@ def layout(source: Source) -> dict[str, Any]:
     state = [f for f in fields if f.split("/")[0] == "observations" and f not in {GOAL_FIELD, *pictures}]
     if not state:
         raise BadInputError(f"{source}: expected observations that are no pictures, got {', '.join(sorted(pictures))}")
-    columns = {
-        STATE: {"fields": state},
-        NEXT_STATE: {"fields": [f"next_{field}" for field in state]},
-        ACTION: {"fields": [field for field in fields if field.split("/")[0] == "actions"]},
-        REWARD: {"fields": ["rewards"]},
-        TERMINATED: {"fields": ["terminations"]},
-        TRUNCATED: {"fields": ["truncations"]},
-    }
+    columns = {STATE: {"fields": state}, NEXT_STATE: {"fields": [f"next_{field}" for field in state]}}
+    columns |= {name: {"fields": [field]} for name, field in MINARI.items()}
+    columns[ACTION]["fields"] = [field for field in fields if field.split("/")[0] == "actions"]
     return {"columns": columns | ({GOAL: {"fields": [GOAL_FIELD]}} if GOAL_FIELD in fields else {})}
 
 
