@@ -129,11 +129,8 @@ def read_description(root: Path) -> dict[str, Any]:
 
 def alteration(columns: Mapping[str, Array], episode: int, digests: Digests, path: Path, row: int) -> str | None:
     """Say which `columns` of an episode, from `row` of the file at `path` on, differ from their digests, if any do."""
-    altered = [
-        name
-        for name, values in columns.items()
-        if name in digests and episode < len(digests[name]) and digest_of(values) != digests[name][episode]
-    ]
+    written = {name: each[episode] for name, each in digests.items() if episode < len(each)}
+    altered = [name for name, values in columns.items() if name in written and digest_of(values) != written[name]]
     if not altered:
         return None
     where = f"{'/'.join(path.parts[-3:])} rows {row} to {row + len(columns[altered[0]]) - 1}"

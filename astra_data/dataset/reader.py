@@ -328,9 +328,8 @@ def _parsed(root: Path, description: dict[str, Any]) -> dict[str, Any]:
         for (chunk, file), count in zip(places.tolist(), np.bincount(place.ravel(), lengths), strict=True)
     }
     faults = [f"{name}: {camera.fault}" for name, camera in cameras.items() if camera.fault]
-    faults += [
-        f"{path.relative_to(root)} does not belong to it" for path in sorted({*plain.data_files(root)} - {*rows})
-    ]
+    others = [path.relative_to(root) for path in plain.data_files(root) if path not in rows]
+    faults += [f"{path} does not belong to it" for path in others]
     for path, expected in rows.items():
         name, footer = path.relative_to(root), plain.read_footer(path)
         if isinstance(footer, str):

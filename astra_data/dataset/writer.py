@@ -448,11 +448,8 @@ class StagedWriter:
 
 def write_staged(path: Path, episode: Episode, schema: pa.Schema) -> None:
     """Write the columns of `schema`, with their digests, uid and metadata."""
-    facts = {
-        "uid": episode.uid,
-        "metadata": dict(episode.metadata),
-        "digests": {name: described.digest_of(episode.columns[name]) for name in schema.names},
-    }
+    digests = {name: described.digest_of(episode.columns[name]) for name in schema.names}
+    facts = {"uid": episode.uid, "metadata": dict(episode.metadata), "digests": digests}
     arrays = [to_arrow(episode.columns[name]) for name in schema.names]
     schema = schema.with_metadata({"episode": json.dumps(facts)})
     with path.open("wb") as sink, pa.ipc.new_file(sink, schema) as file:

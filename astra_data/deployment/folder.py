@@ -114,10 +114,8 @@ def write_lerobot_files(about: Mapping[str, Any], folder: Path) -> None:
         return {name: {"type": kind, "shape": [size]}} if size else {}
 
     device = {"registry_name": "device_processor", "config": {"device": "cpu", "float_dtype": None}}
-    batched = [
-        {"registry_name": "rename_observations_processor", "config": {"rename_map": {}}},
-        {"registry_name": "to_batch_processor", "config": {}},
-    ]
+    renamed = {"registry_name": "rename_observations_processor", "config": {"rename_map": {}}}
+    batched = {"registry_name": "to_batch_processor", "config": {}}
     config = {
         "type": TYPE,
         "input_features": features("STATE", STATE, "state") | features("ENV", GOAL, "goal"),
@@ -126,7 +124,7 @@ def write_lerobot_files(about: Mapping[str, Any], folder: Path) -> None:
         "push_to_hub": False,
     }
     before, after = "policy_preprocessor", "policy_postprocessor"
-    pipelines = {before: [*batched, device], after: [device]}
+    pipelines = {before: [renamed, batched, device], after: [device]}
     written = {name: {"name": name, "steps": steps} for name, steps in pipelines.items()}
     for name, values in (written | {"config": config}).items():
         (folder / f"{name}.json").write_text(json.dumps(values, indent=1))

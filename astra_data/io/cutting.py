@@ -453,9 +453,8 @@ def _cast(values: Array, column: Column) -> tuple[Array, Bools]:
     sound = values[finite.all(axis=1)]
     if column.dtype == "float32":
         if sound.dtype.kind in "iu" and ((sound > EXACT) | (sound < -EXACT)).any():
-            raise BadInputError(
-                'integers beyond 2^53 do not fit float32; set dtype = "int64", or a scale or offset to make them small'
-            )
+            advice = 'set dtype = "int64", or a scale or an offset that makes them small'
+            raise BadInputError(f"integers beyond 2^53 do not fit float32; {advice}")
         with np.errstate(over="ignore"):
             cast = np.ascontiguousarray(values, np.float32)
         return cast, finite & np.isfinite(cast)

@@ -173,11 +173,8 @@ def guess(paths: Sequence[Path]) -> Logs:
         cut = [field.name for field in fields if field.role == "episode" or field.name in gaps]
         why = f"look at {' and '.join(cut)}, which cut or lack rows" if cut else "record longer"
         raise BadInputError(f"{first}: expected episodes of two rows or more, found none: {why}")
-    scaled = [
-        {field.name: one[field.name][run] * field.scale + field.offset for field in fields}
-        for one, of in zip(raw, runs, strict=True)
-        for run in of
-    ]
+    parts = [(one, run) for one, of in zip(raw, runs, strict=True) for run in of]
+    scaled = [{f.name: one[f.name][run] * f.scale + f.offset for f in fields} for one, run in parts]
     cut_off = [str(source.path) for source, is_torn in zip(sources, torn, strict=True) if is_torn]
     logs = Logs(tuple(fields), tuple(scaled), gaps, tuple(cut_off))
     if abs(logs.recorded_rate / logs.rate - 1) > RATE_TOLERANCE:

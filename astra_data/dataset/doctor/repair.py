@@ -280,13 +280,10 @@ def _seen(
 def _metadata(folder: Path, notes: list[str]) -> dict[int, dict[str, Scalar]]:
     """Return the episodes' metadata by uid, empty where it cannot be read."""
     table = read_small_table(folder / layout.METADATA_PATH)
-    found = {
-        row[names.EPISODE_UID]: {
-            key: value for key, value in row.items() if key not in layout.METADATA_KEYS and value is not None
-        }
-        for row in ([] if isinstance(table, str) else table.to_pylist())
-        if isinstance(row.get(names.EPISODE_UID), int)
-    }
+    found: dict[int, dict[str, Scalar]] = {}
+    for row in [] if isinstance(table, str) else table.to_pylist():
+        if isinstance(uid := row.get(names.EPISODE_UID), int):
+            found[uid] = {k: v for k, v in row.items() if k not in layout.METADATA_KEYS and v is not None}
     if not found:
         notes.append(f"{layout.METADATA_PATH} {table if isinstance(table, str) else 'has no uids'}: {_LOST}")
     return found

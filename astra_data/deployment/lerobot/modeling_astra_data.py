@@ -88,7 +88,6 @@ class AstraDataPolicy(PreTrainedPolicy):  # type: ignore[misc]
         is_shaped = given is not None and given.ndim == 2 and given.shape[1] == len(names)
         if given is not None and is_shaped and given.isfinite().all():
             return given.float().cpu()
-        came = (
-            "some that are not finite" if is_shaped else "none" if given is None else f"the shape {tuple(given.shape)}"
-        )
+        shape = "none" if given is None else f"the shape {tuple(given.shape)}"
+        came = "some that are not finite" if is_shaped else shape
         raise BadInputError(f"{column}: expected finite values (B, {len(names)}), {called} {names}, got {came}")

@@ -29,13 +29,13 @@ _HELD = 5  # periods of a joined file for which its last row may be held without
 _SHOWN = 80  # characters of a line above the header that are shown
 
 
-def delimiter_of(name: str) -> str:
-    """Return what parts the fields of the file `name`."""
-    return "\t" if name.lower().endswith(".tsv") else ","
+def delimiter_of(source: Source) -> str:
+    """Return what parts the fields of a file."""
+    return "\t" if str(source).lower().endswith(".tsv") else ","
 
 
-def whole_lines(source: Source, name: str) -> tuple[bytes, bool]:
-    """Return the file `name` without a last line that ends within a row, and whether there was such a line.
+def whole_lines(source: Source) -> tuple[bytes, bool]:
+    """Return a file without a last line that ends within a row, and whether there was such a line.
 
     That line has no end and fewer fields than the header, or nothing in the last, as where a battery went empty;
     with quotes it is left to the parser. Raise BadInputError if the file is no UTF-8, or its header no names parted as
@@ -45,17 +45,17 @@ def whole_lines(source: Source, name: str) -> tuple[bytes, bool]:
         content = stream.read()
     header = re.match(rb"(?:\r?\n)*(.*)", content)[1].rstrip(b"\r")  # type: ignore[index]
     if header.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        raise BadInputError(f"{name}: expected text in UTF-8, got UTF-16: {_SAVE}")
-    delimiter, first = delimiter_of(str(source)), header.decode()
+        raise BadInputError(f"{source}: expected text in UTF-8, got UTF-16: {_SAVE}")
+    delimiter, first = delimiter_of(source), header.decode()
     cells = [cell.strip().strip('"') for cell in first.split(delimiter)]
     # Of pandas, columns without names are called 0, 1, 2, ...
     if cells != [str(number) for number in range(len(cells))] and all(map(_NUMBER.fullmatch, cells)):
         names = delimiter.join(f"f{number}" for number in range(len(cells)))
         advice = f"write one above the first line, such as {shortened(names, _SHOWN)} (sed -i '1i NAMES' FILE)"
-        raise BadInputError(f"{name}: expected a header with a name for each field, got numbers: {advice}")
+        raise BadInputError(f"{source}: expected a header with a name for each field, got numbers: {advice}")
     if delimiter not in first and (others := [other for part, other in _MARKS.items() if part in first]):
         raise BadInputError(
-            f"{name}: expected fields parted by {_MARKS[delimiter]}, got {others[0]} in its header: "
+            f"{source}: expected fields parted by {_MARKS[delimiter]}, got {others[0]} in its header: "
             "write it with commas, or with tabs as .tsv, and numbers with decimal points"
         )
     tail = content[max(content.rfind(b"\n"), content.rfind(b"\r")) + 1 :]
@@ -66,16 +66,16 @@ def whole_lines(source: Source, name: str) -> tuple[bytes, bool]:
 
 
 @contextmanager
-def explained(name: str, source: Source) -> Iterator[None]:
-    """Raise BadInputError with what makes the file `name` no CSV, in which line, and what to do."""
+def explained(source: Source) -> Iterator[None]:
+    """Raise BadInputError with what makes a file no CSV, in which line, and what to do."""
     try:
         yield
     except UnicodeDecodeError as error:
         found = f"the byte 0x{error.object[error.start]:02x}"
-        raise BadInputError(f"{name}: expected text in UTF-8, got {found}: {_SAVE}") from None
+        raise BadInputError(f"{source}: expected text in UTF-8, got {found}: {_SAVE}") from None
     except pa.ArrowInvalid as error:
         if "UTF8" in str(error):
-            raise BadInputError(f"{name}: expected text in UTF-8 ({in_short(error)}): {_SAVE}") from None
+            raise BadInputError(f"{source}: expected text in UTF-8 ({in_short(error)}): {_SAVE}") from None
         with suppress(python_csv.Error), _lines(source) as lines:
             header = next(lines, (1, []))[1]
             for number, cells in lines:
@@ -84,9 +84,9 @@ def explained(name: str, source: Source) -> Iterator[None]:
                     if len(header) == 1 or header[0].startswith("#"):
                         advice = f"leave out what is above the header, {shortened(repr(header[0]), _SHOWN)}"
                     fault = f"Expected {len(header)} columns, got {len(cells)}: {advice}"
-                    raise BadInputError(f"{name} cannot be read as csv: line {number}: {fault}") from None
+                    raise BadInputError(f"{source} cannot be read as csv: line {number}: {fault}") from None
         advice = "leave it out" if "Empty" in str(error) else _SAVE
-        raise BadInputError(f"{name}: expected CSV with a header ({in_short(error)}): {advice}") from None
+        raise BadInputError(f"{source}: expected CSV with a header ({in_short(error)}): {advice}") from None
 
 
 def line_of(source: Source, row: int) -> int:
@@ -100,7 +100,7 @@ def line_of(source: Source, row: int) -> int:
 def _lines(source: Source) -> Iterator[Iterator[tuple[int, list[str]]]]:
     """Open a file as its lines that are not empty: their numbers, from 1, and their cells."""
     with source.open() as stream, io.TextIOWrapper(stream, "utf-8", "replace", newline="") as text:
-        reader = python_csv.reader(text, delimiter=delimiter_of(str(source)))
+        reader = python_csv.reader(text, delimiter=delimiter_of(source))
         yield ((reader.line_num, cells) for cells in reader if cells)
 
 
@@ -173,9 +173,9 @@ def _plain(fields: Iterable[str]) -> list[str]:
 
 def texts_of(source: Source, fields: Sequence[str] = ()) -> tuple[dict[str, pa.StringArray], bool, list[str]]:
     """Return the cells of `fields`, or of all; whether a last line is cut off and left out; and the names of all."""
-    with explained(str(source), source):
-        content, is_torn = whole_lines(source, str(source))
-        options = csv.ParseOptions(delimiter=delimiter_of(str(source)))
+    with explained(source):
+        content, is_torn = whole_lines(source)
+        options = csv.ParseOptions(delimiter=delimiter_of(source))
         header = csv.open_csv(io.BytesIO(content), parse_options=options).schema.names
         known = [name for name in header if name]
         if not known:

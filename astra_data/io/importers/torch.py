@@ -24,9 +24,8 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     try:
         found = torch.load(source.path, map_location="cpu", weights_only=True)
     except UnpicklingError as error:
-        raise BadInputError(
-            f"{source}: holds Python objects, which are never unpickled, or is damaged; save a dict of tensors alone"
-        ) from error
+        fault = "holds Python objects, which are never unpickled, or is damaged"
+        raise BadInputError(f"{source}: {fault}; save a dictionary of tensors alone") from error
     if not isinstance(found, dict):
         raise BadInputError(f"{source}: expected a dictionary of tensors, got {type(found).__name__}")
     tensors = {
