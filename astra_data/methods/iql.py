@@ -18,10 +18,10 @@ from astra_data.core.lazy import Tensor, torch, without_gradients
 from astra_data.core.seeding import derive
 from astra_data.dataset.columns import REWARD
 from astra_data.grounding.descent import refuse_divergence, seed_generators
-from astra_data.grounding.paired_episodes import PairedEpisodes, draw_steps
+from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.methods.method import Method, Table
 from astra_data.policies.running_policy import PolicyFile
-from astra_data.policies.simulator_env import policy_observation
+from astra_data.policies.simulator_env import Recorded, policy_observation
 from astra_data.policies.train import Training
 from astra_data.worlds.task import Task
 
@@ -76,23 +76,12 @@ class IqlConfig(Config):
 
 
 @dataclass(frozen=True)
-class Experience:
-    """E recorded episodes of up to T steps, padded; observations are what the policy sees, then what critics do."""
+class Experience(Recorded):
+    """Recorded episodes with their outcomes; observations are what the policy sees, then what critics do."""
 
-    observation: Tensor  # (E, T, O)
-    previous_action: Tensor  # (E, T, A), zero at the start
-    action: Tensor  # (E, T, A)
-    lengths: Tensor  # (E,), the number of real steps
     reward: Tensor  # (E, T)
     next_observation: Tensor  # (E, T, O)
     terminated: Tensor  # (E, T) bool, the task ended there: no bootstrapping; not set by time-outs
-
-    def draw(self, count: int, length: int, burn_in: int) -> tuple[tuple[Tensor, Tensor], Tensor]:
-        """Draw places of windows, episodes (count, 1) and steps (count, length), and which to learn from."""
-        episodes, steps, learned = draw_steps(self.lengths, count, length)
-        learned &= steps < self.lengths[episodes]
-        learned &= (torch.arange(steps.shape[1], device=steps.device) >= burn_in) | (steps[:, :1] == 0)
-        return (episodes, steps), learned
 
 
 class Transitions(NamedTuple):

@@ -20,10 +20,12 @@ from astra_data.worlds.protocols import BatchedEnv
 
 if TYPE_CHECKING:
     from astra_data.policies.networks import SoftActor
+    from astra_data.policies.simulator_env import Recorded
 
 _REWARD_SCALE = 0.1  # factor on the reward that the critics learn from
 _INITIAL_TEMPERATURE = 0.2  # weight of the entropy in the reward at the start
 _TARGET_RATE = 0.005  # polyak rate of the target critics, per update
+_IMITATION_WEIGHT = 0.4  # of the distance from recorded actions, in mean action values; of Fujimoto and Gu (2021)
 
 
 class SacConfig(Config):
@@ -61,10 +63,23 @@ class SacConfig(Config):
 class Sac(Learner):
     """A training in progress, of the actor `policy`."""
 
-    def __init__(self, env: BatchedEnv, policy: "SoftActor", config: SacConfig, *, horizon: int, seed: int) -> None:
+    def __init__(
+        self,
+        env: BatchedEnv,
+        policy: "SoftActor",
+        config: SacConfig,
+        *,
+        horizon: int,
+        seed: int,
+        recorded: "Recorded | None" = None,
+    ) -> None:
+        """Train in `env`, with episodes of at most `horizon` steps; the policy imitates what was `recorded`, if given.
+
+        The actor's loss then has a term of behavior cloning (Fujimoto and Gu 2021, arXiv 2106.06860, eq. 3).
+        """
         from astra_data.policies.networks import RecurrentCritics
 
-        self.policy, self.config = policy, config
+        self.policy, self.config, self._recorded = policy, config, recorded
         torch.manual_seed(derive(seed, "critics"))
         device = next(policy.parameters()).device
         self._critics = RecurrentCritics(policy.shape).to(device)
@@ -155,8 +170,19 @@ class Sac(Learner):
         critics.requires_grad_(False)
         actor_loss = (temperature * log_prob - critics(judging.detach(), action).amin(0)).mean()
         critics.requires_grad_(True)
+        if self._recorded is not None:
+            size = actor_loss.detach().abs()  # for the most part action values
+            actor_loss = actor_loss + _IMITATION_WEIGHT * size * self._distance(self._recorded)
         surplus = action.shape[-1] - log_prob.detach().mean()
         return critic_loss, actor_loss, self._log_temperature * surplus
+
+    def _distance(self, recorded: "Recorded") -> Tensor:
+        """Return the mean squared distance of the policy's actions, without exploration, from recorded ones."""
+        steps, learned = recorded.draw(self.config.batch_size // self._window, self._window, self._burn_in)
+        start = torch.zeros_like(learned, dtype=torch.float32)
+        seen = recorded.observation[steps], recorded.previous_action[steps]
+        features = self.policy.remember_sequence(*seen, self.policy.initial_hidden(len(learned)), start)
+        return (self.policy.act(features[learned]) - recorded.action[steps][learned]).square().mean()
 
 
 class Replay:

@@ -8,7 +8,7 @@ import numpy as np
 from astra_data.core.config import Config, NotNegative, Positive, Share
 from astra_data.core.errors import BadInputError
 from astra_data.core.lazy import Tensor, torch, without_gradients
-from astra_data.grounding.paired_episodes import RISK_STEPS, PairedEpisodes
+from astra_data.grounding.paired_episodes import RISK_STEPS, PairedEpisodes, draw_steps
 from astra_data.grounding.simulator import EpisodeSimulator, Grounding
 from astra_data.worlds.objective import NO_LIMIT, Objective
 from astra_data.worlds.protocols import Step
@@ -51,6 +51,34 @@ def policy_observation(objective: Objective, state: Tensor, goal: Tensor, latent
     """Assemble a policy's observation (..., O): the latent (..., Z), if any, scaled to about 1, then state and goal."""
     seen = objective.observe(state.flatten(0, -2), goal.flatten(0, -2)).unflatten(0, state.shape[:-1])
     return seen if latent is None else torch.cat([latent / latent.shape[-1] ** 0.5, seen], dim=-1)
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """E recorded episodes of up to T steps as a policy sees them, padded."""
+
+    observation: Tensor  # (E, T, O)
+    previous_action: Tensor  # (E, T, A), zero at the start
+    action: Tensor  # (E, T, A)
+    lengths: Tensor  # (E,), the number of real steps
+
+    def draw(self, count: int, length: int, burn_in: int) -> tuple[tuple[Tensor, Tensor], Tensor]:
+        """Draw places of windows, episodes (count, 1) and steps (count, length), and which to learn from."""
+        episodes, steps, learned = draw_steps(self.lengths, count, length)
+        learned &= steps < self.lengths[episodes]
+        learned &= (torch.arange(steps.shape[1], device=steps.device) >= burn_in) | (steps[:, :1] == 0)
+        return (episodes, steps), learned
+
+
+@without_gradients
+def recorded_steps(task: Task, episodes: PairedEpisodes, grounding: Grounding) -> Recorded:
+    """Return `episodes` as a policy would have seen them that is trained with `grounding`."""
+    windows, latent = episodes.windows, None
+    if (source := grounding.encoder) is not None:
+        inputs = source.encoder_input(windows.state, windows.goal, windows.previous_action)
+        latent, _ = source.encoder.sequence(inputs)
+    seen = policy_observation(task.objective, windows.state, windows.goal, latent)
+    return Recorded(seen, windows.previous_action, windows.action, episodes.lengths)
 
 
 class SimulatorEnv:

@@ -34,6 +34,7 @@ from astra_data.policies.simulator_env import (
     WorldConfig,
     command_limit,
     data_starts,
+    recorded_steps,
     training_env,
 )
 from astra_data.worlds.task import Task
@@ -165,7 +166,8 @@ def train_in(
     options = {"horizon": horizon, "seed": training.seed}
     learner: Ppo | Sac
     if isinstance(config, SacTrainConfig):
-        learner = Sac(env, SoftActor(shape).to(training.device), config, **options)
+        recorded = recorded_steps(training.task, training.episodes, training.grounding) if training.is_plus else None
+        learner = Sac(env, SoftActor(shape).to(training.device), config, **options, recorded=recorded)
     else:
         policy = ActorCritic(shape).to(training.device)
         learner = Ppo(env, policy, config, **options)

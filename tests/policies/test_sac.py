@@ -11,15 +11,18 @@ from astra_data.core.errors import BadInputError
 from astra_data.policies import sac as module
 from astra_data.policies.networks import PolicyShape, SoftActor
 from astra_data.policies.sac import Replay, Sac, SacConfig
+from astra_data.policies.simulator_env import Recorded
 from astra_data.worlds.protocols import BatchedEnv
 
 
-def sac(env: BatchedEnv, steps: int, *, horizon: int, memory: int = 0, **settings: Any) -> Sac:
+def sac(
+    env: BatchedEnv, steps: int, *, horizon: int, memory: int = 0, recorded: Recorded | None = None, **settings: Any
+) -> Sac:
     usual = {"rollout_steps": 10, "updates_per_step": 2, "batch_size": 64, "discount": 0.9}
     config = SacConfig(total_steps=steps * env.num_envs, **{**usual, **settings})
     torch.manual_seed(0)
     shape = PolicyShape(env.observation_size, env.action_size, memory, 16, (32, 32))
-    return Sac(env, SoftActor(shape), config, horizon=horizon, seed=1)
+    return Sac(env, SoftActor(shape), config, horizon=horizon, seed=1, recorded=recorded)
 
 
 def test_the_second_half_learns_ever_more_slowly() -> None:
@@ -49,13 +52,24 @@ def test_where_the_episodes_cannot_go_on_its_replay_does_not_either() -> None:
     assert torch.equal(cut[:-1], kept[:-1]) and cut[-1].all() and not kept[-1].any()
 
 
-@pytest.mark.parametrize("memory", [0, 8])
-def test_an_update_is_that_of_the_printed_losses(memory: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Haarnoja et al. (2018), by hand from the windows that were drawn."""
+@pytest.mark.parametrize(("memory", "imitates"), [(0, False), (8, False), (8, True)])
+def test_an_update_is_that_of_the_printed_losses(memory: int, imitates: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Haarnoja et al. (2018), and Fujimoto and Gu (2021), by hand from the windows that were drawn."""
     settings: dict[str, Any] = {"window": 6, "burn_in": 2, "batch_size": 512}
-    for name, value in {"_TARGET_RATE": 0.3, "_INITIAL_TEMPERATURE": 0.4, "_REWARD_SCALE": 3.0}.items():
+    scale = -3.0 if imitates else 3.0  # so that action values have either sign
+    for name, value in {"_TARGET_RATE": 0.3, "_INITIAL_TEMPERATURE": 0.4, "_REWARD_SCALE": scale}.items():
         monkeypatch.setattr(module, name, value)
-    learner = sac(EndsAtZero(8), 60, horizon=9, memory=memory, **settings)
+    told, commands = torch.randn(5, 20, 1), torch.randn(5, 20, 1).tanh()
+    recorded = Recorded(told, commands.roll(1, 1), commands, torch.tensor([20, 12, 3, 9, 20]))
+    copied: list[tuple[tuple[torch.Tensor, torch.Tensor], torch.Tensor]] = []
+    choose = Recorded.draw
+
+    def chosen(*given: Any) -> tuple[tuple[torch.Tensor, torch.Tensor], torch.Tensor]:
+        copied.append(choose(*given))
+        return copied[-1]
+
+    monkeypatch.setattr(Recorded, "draw", chosen)
+    learner = sac(EndsAtZero(8), 60, horizon=9, memory=memory, recorded=recorded if imitates else None, **settings)
     for _ in range(3):
         learner.iterate()
     policy, critics, replay = learner.policy, learner._critics, learner._replay
@@ -122,12 +136,19 @@ def test_an_update_is_that_of_the_printed_losses(memory: int, monkeypatch: pytes
         assert expired.any() and not (learned & expired).any()
         within = learned & ~steps["first"][:, 1:]
         shown = steps["observation"][:, 1:, 0][within]
-        torch.testing.assert_close(steps["reward"][:, :-1][within], -3.0 * shown.square())
+        torch.testing.assert_close(steps["reward"][:, :-1][within], -scale * shown.square())
         target = reward + 0.9 * ~over * beyond
         given = action_values(online, judging[:, :-1][learned], steps["action"][:, :-1][learned])
         wrong = (given - target).square().sum(0).mean()
         action, log_prob = squashed(acting[:, :-1][learned])
         costs = (temperature * log_prob - action_values(online, judging[:, :-1][learned], action).amin(0)).mean()
+        if imitates:
+            (place, clear), shape = copied[-1], (85, 6)
+            assert clear.shape == shape and not clear[:, :2][place[1][:, 0] > 0].any() and (costs < 0) == imitates
+            begins = torch.zeros(shape)
+            shown = actor.remember_sequence(told[place], commands.roll(1, 1)[place], actor.initial_hidden(85), begins)
+            apart = actor.act(shown[clear]) - commands[place][clear]
+            costs = costs + 0.4 * costs.abs() * apart.square().mean()
         # The temperature rises where actions are less random than one unit of entropy per dimension below 0.
         calm = -math.log(temperature) * (log_prob.mean() - 1.0)
     torch.testing.assert_close(torch.stack(losses), torch.stack([wrong, costs, calm]), rtol=1e-4, atol=1e-4)

@@ -279,12 +279,19 @@ def test_recorded_starts_come_with_the_history_before_them(
     assert starts is not None and starts.hidden is not None and len(starts.state) == len(starts.hidden) == 700
     windows, model = episodes.windows, grounding.model
     inputs = model.encoder_input(windows.state, windows.goal, windows.previous_action)
-    hidden = torch.zeros(1, 8)
+    hidden, shown = torch.zeros(1, 8), simulator_env.recorded_steps(TASK, episodes, grounding)
+    assert torch.equal(shown.lengths, episodes.lengths) and torch.equal(shown.action, windows.action)
+    assert torch.equal(shown.previous_action, windows.previous_action)
+    world = built(FROM_DATA, grounding, starts=starts)
     for step in range(5):
         row = 400 + step  # of the second episode
         torch.testing.assert_close(starts.hidden[row : row + 1], hidden)
         assert torch.equal(starts.state[row], windows.state[1, step])
         assert torch.equal(starts.previous_action[row], windows.previous_action[1, step])
+        world.start_from(
+            windows.state[1:, step], windows.goal[1:, step], torch.arange(1), hidden, inputs[1:, step, -2:]
+        )
+        torch.testing.assert_close(world.reset(torch.zeros(4, dtype=torch.bool))[:1], shown.observation[1:, step])
         hidden = model.encoder.step(inputs[1:, step], hidden)
 
 

@@ -2,6 +2,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -190,6 +191,15 @@ def test_rows_and_their_plus_rows_differ_by_the_plus_settings_alone(
     assert priced.world == known.world.model_copy(update=changes)
     assert (plain.world, plus.world) == (known.world, priced.world) and plain.num_envs == PPO.num_envs
     assert not plain.draws_failures and not plus.draws_failures
+    given = replace(given, config=train.SacTrainConfig(learner="sac", num_envs=4))
+    monkeypatch.setattr(train, "recorded_steps", lambda *told: told)
+    monkeypatch.setattr(train, "optimize", lambda *told: {})
+    monkeypatch.setattr(train, "Sac", lambda *told, **options: SimpleNamespace(policy=options["recorded"]))
+    monkeypatch.setattr(train.Training, "learned", lambda training, policy, simulation: policy)
+    imitated: list[Any] = [
+        train.InSimulator(reward=reward)(replace(given, is_plus=is_plus))[0] for is_plus in (False, True)
+    ]
+    assert imitated == [None, (given.task, given.episodes, given.grounding)]
 
 
 def test_each_try_has_its_part_of_the_progress_and_a_policy_says_what_it_learned_from(
