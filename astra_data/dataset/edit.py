@@ -78,10 +78,9 @@ def subset(
     assert count is not None
     if not 1 <= count <= available:
         wanted = f"{count} episodes" if percent is None else f"{percent} % of {whole} = {count}"
-        raise BadInputError(
-            f"{source.reference} has {available} episodes, but the subset has {wanted}: expected 1 "
-            f"to {available}. Episodes are never repeated: collect or augment more, or give a smaller --of."
-        )
+        fault = f"{source.reference} has {available} episodes, but the subset has {wanted}: expected 1 to {available}"
+        advice = "Episodes are never repeated: collect or augment more, or give a smaller --of."
+        raise BadInputError(f"{fault}. {advice}")
     chosen = source.subset_seed if seed is None else seed
     config: dict[str, Any] = {"episodes": count, "percent": percent, "of": of, "seed": chosen}
     order = source.uids[source.subset(len(source), chosen)].tolist()

@@ -336,10 +336,9 @@ class StagedWriter:
                 raise BadInputError(f"{self.root} is being recorded right now; wait or choose another folder.")
             if self.root.exists():
                 if self._holds_work() and not self._is_written():
-                    raise BadInputError(
-                        f"{self.root} exists already and is another dataset than the interrupted recording, "
-                        f"which left {self._left()} in {self.folder}: move one of the two away."
-                    )
+                    fault = f"{self.root} exists already and is another dataset than the interrupted recording"
+                    left = f"which left {self._left()} in {self.folder}: move one of the two away."
+                    raise BadInputError(f"{fault}, {left}")
                 durable.discard(self.folder, self.root)  # a kill came between the dataset and this
                 durable.refuse_existing(self.root)
             self._agree_on_the_settings()

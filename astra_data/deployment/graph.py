@@ -139,16 +139,14 @@ def _apart(graph: PolicyGraph, written: Graph) -> float:
             if expected.isfinite().all():
                 break
         else:
-            raise BadInputError(
-                f"{deployed.task.name}: the policy gives no finite command for {_MOST_DRAWS} random states: "
-                "expected φ and the objective to be finite for values around 0"
-            )
+            fault = f"the policy gives no finite command for {_MOST_DRAWS} random states"
+            wanted = "expected φ and the objective to be finite for values around 0"
+            raise BadInputError(f"{deployed.task.name}: {fault}: {wanted}")
         command, hidden = written(state, goal, hidden)
         apart = float(((command - expected).abs() * 2 / (high - low)).max())
         if not apart <= TOLERANCE:
-            raise BadInputError(
-                f"{deployed.task.name}: in step {step} {ONNX} gives the command {command[0].tolist()}, the "
-                f"policy {expected[0].tolist()}: does φ or the objective depend on more than its arguments?"
-            )
+            fault = f"{ONNX} gives the command {command[0].tolist()}, the policy {expected[0].tolist()}"
+            why = "does φ or the objective depend on more than its arguments?"
+            raise BadInputError(f"{deployed.task.name}: in step {step} {fault}: {why}")
         largest = max(largest, apart)
     return largest

@@ -178,10 +178,9 @@ def guess(paths: Sequence[Path]) -> Logs:
     cut_off = [str(source.path) for source, is_torn in zip(sources, torn, strict=True) if is_torn]
     logs = Logs(tuple(fields), tuple(scaled), gaps, tuple(cut_off))
     if abs(logs.recorded_rate / logs.rate - 1) > RATE_TOLERANCE:
-        raise BadInputError(
-            f"{first}: {logs.of('time')[0].name}: expected rows per second within {RATE_TOLERANCE:.0%} "
-            f"of a whole number, as fps is one, got {logs.recorded_rate:.4g}: correct its unit or resample"
-        )
+        wanted = f"expected rows per second within {RATE_TOLERANCE:.0%} of a whole number, as fps is one"
+        got = f"got {logs.recorded_rate:.4g}: correct its unit or resample"
+        raise BadInputError(f"{first}: {logs.of('time')[0].name}: {wanted}, {got}")
     return logs
 
 

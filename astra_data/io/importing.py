@@ -276,10 +276,9 @@ def _blocks(source: Source, module: ModuleType, mapping: ImportMapping) -> Itera
             may_be = steps > 1 and {shape[:1] for shape in several} == {(steps,)}
             are_all = len(several) == len(shapes)
             if mapping.stacked and not (may_be and are_all):
-                raise BadInputError(
-                    f"{origin}: stacked = true, but the fields' rows have the shapes "
-                    f"{', '.join(map(str, shapes.values()))}; expected (steps, ...) with as many steps in each"
-                )
+                listed = ", ".join(map(str, shapes.values()))
+                fault = f"stacked = true, but the fields' rows have the shapes {listed}"
+                raise BadInputError(f"{origin}: {fault}; expected (steps, ...) with as many steps in each")
             if mapping.stacked is None and may_be:
                 has_matrix, is_short = max(map(len, several)) > 1, len(block) < steps
                 is_sure = has_matrix and are_all

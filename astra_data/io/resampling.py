@@ -98,10 +98,8 @@ class Resampler:
             often = f"is silent for over {longest} {times} times while others are not"
             note = f"{self._origin}: {topic} {often}; episodes end there"
             if command := self._commands.get(topic):
-                yield (
-                    f"{note}. That is right if the robot stops by itself without commands; if it continues "
-                    f'with the last one, set latched = true in [columns."{command}"], or a longer gap_s'
-                )
+                right = "That is right if the robot stops by itself without commands; if it continues with the last one"
+                yield f'{note}. {right}, set latched = true in [columns."{command}"], or a longer gap_s'
             else:
                 yield f"{note}: set latched = true if it is sent on change, or a longer gap_s"
 
@@ -167,10 +165,9 @@ class Resampler:
         first = min(self._expiring, key=lambda topic: int(self._moments[topic][-1]) + self._gap_ns[topic])
         apart_ns = self._moments[last][0] - self._moments[first][-1]
         if apart_ns > self._gap_ns[first]:
-            raise BadInputError(
-                f"{self._origin}: {last} begins {apart_ns / 1e9:.4g} s after the last message of {first}, "
-                "and no row can have both: their clocks differ, or one of them was not recorded until the end"
-            )
+            fault = f"{last} begins {apart_ns / 1e9:.4g} s after the last message of {first}"
+            why = "their clocks differ, or one of them was not recorded until the end"
+            raise BadInputError(f"{self._origin}: {fault}, and no row can have both: {why}")
 
     def _refuse_gap(self, time: int) -> None:
         if self._start is None:
@@ -178,10 +175,9 @@ class Resampler:
         moment = self._start + self._row * 10**9 // self._fps
         end = min(time, *(self.times[topic] + self._gap_ns[topic] for topic in self._expiring))
         if (rows := (end - moment) * self._fps // 10**9) > MOST_HELD_ROWS:
-            raise BadInputError(
-                f"{self._origin}: nothing new comes between {moment} and {time} ns, which would be {rows} "
-                f"equal rows, expected at most {MOST_HELD_ROWS}: a time is wrong, or split.gap_s is too long"
-            )
+            fault = f"nothing new comes between {moment} and {time} ns, which would be {rows} equal rows"
+            wanted = f"expected at most {MOST_HELD_ROWS}: a time is wrong, or split.gap_s is too long"
+            raise BadInputError(f"{self._origin}: {fault}, {wanted}")
 
     def _silent(self, time: int) -> list[str]:
         """Return the topics that may not be silent for so long as they were before `time`; all were heard."""

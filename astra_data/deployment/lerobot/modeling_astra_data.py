@@ -57,10 +57,9 @@ class AstraDataPolicy(PreTrainedPolicy):  # type: ignore[misc]
         if self._hidden is None:
             self._hidden = torch.zeros(len(state), self._about["hidden"]["size"])
         if not len(state) == len(goal) == len(self._hidden):
-            raise BadInputError(
-                f"expected states and goals of {len(self._hidden)} robots, as since the last reset, got "
-                f"{len(state)} states and {len(goal)} goals: call reset() before the number of robots changes"
-            )
+            wanted = f"expected states and goals of {len(self._hidden)} robots, as since the last reset"
+            advice = "call reset() before the number of robots changes"
+            raise BadInputError(f"{wanted}, got {len(state)} states and {len(goal)} goals: {advice}")
         try:
             for row in state.numpy():
                 refuse_far(row, self._about["state"])

@@ -79,15 +79,12 @@ def _refuse_change(there: stores.RemoteFolder, local: Dataset) -> None:
     ours = stores.parse_sums(stores.make_sums(local.root), str(local.root))
     listed = stores.parse_sums(there.read_text(stores.SUMS_PATH), there.name)
     if others := sorted(path for path in ours.keys() | listed if ours.get(path) != listed.get(path)):
-        raise BadInputError(
-            f"{there.name} holds other values or was altered: {stores.SUMS_PATH} there differs in "
-            f"{', '.join(others)}. Versions never change: make it again with another --name, or push elsewhere."
-        )
+        fault = f"{there.name} holds other values or was altered: {stores.SUMS_PATH} there differs in"
+        advice = "Versions never change: make it again with another --name, or push elsewhere."
+        raise BadInputError(f"{fault} {', '.join(others)}. {advice}")
     if changed := [path for path, digest in ours.items() if there.differs(path, local.root / path, digest)]:
-        raise SharingError(
-            f"{there.name} was altered: {', '.join(changed)} there differ from {stores.SUMS_PATH}. "
-            "Delete this version there and push it again, or push elsewhere."
-        )
+        fault = f"{there.name} was altered: {', '.join(changed)} there differ from {stores.SUMS_PATH}"
+        raise SharingError(f"{fault}. Delete this version there and push it again, or push elsewhere.")
 
 
 def pull(

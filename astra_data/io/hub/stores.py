@@ -177,10 +177,9 @@ class HubStore:
             # None stands for the default of the user or the organization.
             api.create_repo(self.repo, repo_type=KIND, private=private or None, exist_ok=True)
             if private and not api.repo_info(self.repo, repo_type=KIND).private:
-                raise BadInputError(
-                    f"{self.repo} exists already and is public, expected a private repository. Nothing was uploaded: "
-                    "make it private in its settings on the Hub, choose another, or leave out --private."
-                )
+                advice = "make it private in its settings on the Hub, choose another, or leave out --private."
+                fault = f"{self.repo} exists already and is public, expected a private repository"
+                raise BadInputError(f"{fault}. Nothing was uploaded: {advice}")
 
     def versions(self) -> list[Version]:
         """Return the tagged versions, the oldest first."""

@@ -271,10 +271,9 @@ class MessageField:
             return
         if self._names is not None:
             by_name = self.name.removesuffix(f".{self._keys[-1]}" if self._keys[-1].isdecimal() else "")
-            raise BadInputError(
-                f"'{self.name}' is in another order than before: its names are {', '.join(names)}, and were "
-                f"{', '.join(self._names)}; take each value by its name, '{by_name}[{self._names[0]}]'"
-            )
+            advice = f"take each value by its name, '{by_name}[{self._names[0]}]'"
+            order = f"its names are {', '.join(names)}, and were {', '.join(self._names)}"
+            raise BadInputError(f"'{self.name}' is in another order than before: {order}; {advice}")
         self._names = names
 
 

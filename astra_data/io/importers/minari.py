@@ -82,10 +82,9 @@ def _after_steps(fields: dict[str, Array], mapping: ImportMapping, origin: str) 
         (observed if name.startswith("observation") else others).update(column.fields)
     with_reset = sorted(name for name in fields if name.startswith("infos/") and f"next_{name}" in fields)
     if both := [name for name in with_reset if name in observed & others]:
-        raise BadInputError(
-            f"{origin}: {', '.join(both)} has an entry for the reset, too, and is taken as an observation, "
-            f"before a step, and of its outcome: write next_{both[0]} for what is after the step"
-        )
+        fault = f"{', '.join(both)} has an entry for the reset, too, and is taken as an observation, before a step"
+        advice = f"write next_{both[0]} for what is after the step"
+        raise BadInputError(f"{origin}: {fault}, and of its outcome: {advice}")
     after = [name for name in with_reset if name in others]
     for name in after:
         fields[name] = fields[f"next_{name}"]
