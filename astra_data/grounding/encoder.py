@@ -165,20 +165,12 @@ class _Recurrence(torch.autograd.Function):
     """A GRU over T steps whose gradient takes a quarter of torch's time on a CPU: all that can be is done at once."""
 
     @staticmethod
-    def forward(
-        context: FunctionCtx,
-        inputs: Tensor,
-        hidden: Tensor,
-        keep: Tensor,
-        input_weight: Tensor,
-        weight: Tensor,
-        input_bias: Tensor,
-        bias: Tensor,
-    ) -> Tensor:
+    def forward(context: FunctionCtx, inputs: Tensor, hidden: Tensor, keep: Tensor, *weights: Tensor) -> Tensor:
         """Return the states (T, B, Z) for inputs (T, B, I), from `hidden` (B, Z); `keep` is (T, B, 1)."""
+        input_weight, weight, input_bias, bias = weights
         given = functional.linear(inputs, input_weight, input_bias)
         if inputs.is_cuda:  # one kernel does a step
-            both = zip(*_stepped(inputs, hidden, keep, input_weight, weight, input_bias, bias), strict=True)
+            both = zip(*_stepped(inputs, hidden, keep, *weights), strict=True)
             before, states = map(torch.stack, both)
             gates, new = functional.linear(before, weight, bias), torch.empty_like(before)
             _open(gates, given, new)

@@ -240,12 +240,8 @@ def learn_from_episodes(training: Training) -> tuple[PolicyFile, dict[str, Any]]
     experience = experience_of(training.task, episodes)
     torch.manual_seed(derive(training.seed, "policy"))
     if training.initial is None:
-        shape = PolicyShape(
-            observation_size=experience.observation.shape[-1] - _position_features(training.task).size,
-            action_size=experience.action.shape[-1],
-            memory_size=training.config.memory_size,
-            hidden_sizes=training.config.hidden_sizes,
-        )
+        seen, given = experience.observation.shape[-1] - _position_features(training.task).size, training.config
+        shape = PolicyShape(seen, experience.action.shape[-1], given.memory_size, hidden_sizes=given.hidden_sizes)
         policy: Policy = ActorCritic(shape).to(training.device)
     else:
         policy = copy.deepcopy(training.initial.policy).requires_grad_(True)
@@ -288,13 +284,7 @@ def experience_of(task: Task, episodes: PairedEpisodes) -> Experience:
         for state in (windows.state, windows.next_state)
     )
     return Experience(
-        observation=now,
-        previous_action=windows.previous_action,
-        action=windows.action,
-        reward=episodes.reward,
-        next_observation=later,
-        terminated=episodes.terminated,
-        lengths=episodes.lengths,
+        now, windows.previous_action, windows.action, episodes.lengths, episodes.reward, later, episodes.terminated
     )
 
 

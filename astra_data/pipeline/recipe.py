@@ -5,16 +5,7 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Self
 
-from pydantic import (
-    BaseModel,
-    BeforeValidator,
-    Field,
-    JsonValue,
-    ValidationInfo,
-    create_model,
-    field_validator,
-    model_validator,
-)
+from pydantic import BeforeValidator, Field, JsonValue, ValidationInfo, create_model, field_validator, model_validator
 
 from astra_data.core.config import Config, Seed, as_fault, load_tables, read_written, validated
 from astra_data.core.errors import BadInputError, RecipeError
@@ -26,6 +17,7 @@ from astra_data.methods import METHODS, add_method, is_of_package, method_named,
 from astra_data.pipeline.shipped import whereabouts
 from astra_data.pipeline.stages.registry import STAGES, Stage
 from astra_data.pipeline.stages.select import judge_of
+from astra_data.reports.artifacts import WrittenPart
 from astra_data.reports.results import WHOLE
 from astra_data.reports.runs import recorded_code
 from astra_data.robots.registry import place_of, task_named
@@ -128,12 +120,12 @@ def digests_of(task: str, user_methods: Mapping[str, UserMethod]) -> dict[str, s
     return {name: digest for name, digest in found.items() if digest}
 
 
-class _Record(BaseModel, extra="allow"):
+class _Record(WrittenPart, extra="allow"):
     """What is read of a record before it is known to be a recipe of today."""
 
     task: str
-    user_methods: dict[str, UserMethod] = {}
-    sweep: dict[str, JsonValue] = {}
+    user_methods: dict[str, UserMethod] = Field(default_factory=dict)
+    sweep: dict[str, JsonValue] = Field(default_factory=dict)
 
 
 def recorded_settings(folder: Path) -> dict[str, Any]:

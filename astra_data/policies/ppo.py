@@ -108,7 +108,7 @@ class Ppo(Learner):
         following = torch.cat([rollout["value"][:, 1:], policy.value(last).unsqueeze(1)], dim=1)
         following = torch.where(rollout["done"], rollout["beyond"], following)
         parts = rollout["value"], following, rollout["reward"], rollout["done"], rollout["terminated"]
-        advantage = generalized_advantages(*parts, discount=self.config.discount, gae_lambda=GAE_LAMBDA)
+        advantage = generalized_advantages(*parts, discount=self.config.discount)
         return rollout | {"advantage": advantage, "value_target": advantage + rollout["value"]}
 
     def _learn(self, rollout: dict[str, Tensor]) -> None:
@@ -150,18 +150,11 @@ class Ppo(Learner):
 
 
 def generalized_advantages(
-    value: Tensor,
-    following: Tensor,
-    reward: Tensor,
-    done: Tensor,
-    terminated: Tensor,
-    *,
-    discount: float,
-    gae_lambda: float,
+    value: Tensor, following: Tensor, reward: Tensor, done: Tensor, terminated: Tensor, *, discount: float
 ) -> Tensor:
     """Return generalized advantages (B, T) (Schulman et al. 2016, eq. 16); `following` are values after the steps."""
     error = reward + discount * following * ~terminated - value
-    kept = discount * gae_lambda * (~done).to(value.dtype)
+    kept = discount * GAE_LAMBDA * (~done).to(value.dtype)
     advantage, later = torch.empty_like(error), torch.zeros_like(error[:, 0])
     for step in reversed(range(error.shape[1])):
         later = advantage[:, step] = error[:, step] + kept[:, step] * later

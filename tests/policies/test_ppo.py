@@ -73,11 +73,11 @@ def test_generalized_advantages_are_discounted_sums_of_errors_up_to_the_episodes
         for step in range(first, 30):
             error = reward[row, step] - value[row, step]
             error += 0 if terminated[row, step] else 0.9 * following[row, step]
-            expected[row, first] += (0.9 * 0.8) ** (step - first) * error
+            expected[row, first] += (0.9 * module.GAE_LAMBDA) ** (step - first) * error
             if done[row, step]:
                 break
     parts = [torch.from_numpy(part) for part in (value, following, reward, done, terminated)]
-    found = generalized_advantages(*parts, discount=0.9, gae_lambda=0.8).numpy()
+    found = generalized_advantages(*parts, discount=0.9).numpy()
     np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 

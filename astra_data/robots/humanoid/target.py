@@ -83,12 +83,8 @@ LEAN_RAD = 0.1
 SPIN_RAD_S = 1.0
 
 _QUATERNION_SPREAD = 0.2
-_STATE = (
-    *([POSITION_M] * 3 + [_QUATERNION_SPREAD] * 4),
-    *JOINTS_RAD,
-    *([VELOCITY_M_S] * 3 + [SPIN_RAD_S] * 3),
-    *JOINT_RATES_RAD_S,
-)
+_STATE = (*[POSITION_M] * 3, *[_QUATERNION_SPREAD] * 4, *JOINTS_RAD)
+_STATE += (*[VELOCITY_M_S] * 3, *[SPIN_RAD_S] * 3, *JOINT_RATES_RAD_S)
 
 
 def in_spreads(state: Tensor) -> Tensor:

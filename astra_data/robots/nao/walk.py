@@ -14,11 +14,8 @@ from astra_data.core.arrays import Bools, Floats
 
 TICK_S = 0.012  # the robot's own motion cycle (83 Hz), as B-Human's code states it
 GRAVITY = 9.81
-HIP_OFFSET_Y_M = 0.050
-HIP_OFFSET_Z_M = 0.085
-THIGH_M = 0.100
-TIBIA_M = 0.1029
-FOOT_HEIGHT_M = 0.04519
+HIP_OFFSET_Y_M, HIP_OFFSET_Z_M = 0.050, 0.085
+THIGH_M, TIBIA_M, FOOT_HEIGHT_M = 0.100, 0.1029, 0.04519
 _LEG = ("HipRoll", "HipPitch", "KneePitch", "AnklePitch", "AnkleRoll")
 JOINTS = ("HipYawPitch", *(f"{side}{name}" for side in "LR" for name in _LEG))  # the eleven angles, in order
 TO_MOTORS = np.array([0, 1, 2, 3, 4, 5, 0, 6, 7, 8, 9, 10])  # which of the eleven angles each control follows
