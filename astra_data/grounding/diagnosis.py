@@ -393,11 +393,9 @@ def _of_responses(responses: Sequence[Response], fps: float) -> Iterator[Finding
             advice = "that of the robot is not seen either: model it, or leave it out of the commands"
             yield Finding("note", f"{one.name} has no effect in the simulator", advice)
         elif not one.is_visible:
-            yield Finding(
-                "warning",
-                f"{one.name} has no effect that can be seen ({one.gain[0]:.2f} of the simulator's)",
-                "check its units, its order among the commands and the abstraction φ, or record it varied more",
-            )
+            what = f"{one.name} has no effect that can be seen ({one.gain[0]:.2f} of the simulator's)"
+            advice = "check its units, its order among the commands and the abstraction φ, or record it varied more"
+            yield Finding("warning", what, advice)
         elif low > half:
             yield Finding(
                 "note",
@@ -421,15 +419,13 @@ def _of_hidden_state(explained: Sequence[Floats], shown: Sequence[str]) -> Itera
         f"with the past errors {history[0]:.2f}"
     )
     if adds(history, late):
-        yield Finding(
-            "note", what, "there is state that neither the abstract state nor commands show: train `astra_plus`"
-        )
+        advice = "there is state that neither the abstract state nor commands show: train `astra_plus`"
+        yield Finding("note", what, advice)
     elif adds(late, present):
         yield Finding("note", what, "a delay or a lag of the commands is what is hidden: any grounding learns it")
     elif present[0] > _MATTERS:
-        yield Finding(
-            "note", what, "for the motion nothing hidden shows: `nas`, or a parameter of the simulator, may do"
-        )
+        advice = "for the motion nothing hidden shows: `nas`, or a parameter of the simulator, may do"
+        yield Finding("note", what, advice)
     if adds(recorded, history):
         which = f", such as {' and '.join(shown)}," if shown else ""
         advice = f"the simulator may gain from more of it{which} in φ"
@@ -439,11 +435,9 @@ def _of_hidden_state(explained: Sequence[Floats], shown: Sequence[str]) -> Itera
 def _of_commands(log: _Log, commands: Mapping[str, tuple[float, ...]]) -> Iterator[Finding]:
     for name, (least, largest, low, high) in commands.items():
         if min(largest, high) - max(least, low) < 0.5 * (high - low):
-            yield Finding(
-                "warning",
-                f"{name} was given between {least:.3g} and {largest:.3g} alone, of {low:.3g} to {high:.3g}",
-                "no grounding knows what the rest does: record it, or narrow the bounds of `commands`",
-            )
+            what = f"{name} was given between {least:.3g} and {largest:.3g} alone, of {low:.3g} to {high:.3g}"
+            advice = "no grounding knows what the rest does: record it, or narrow the bounds of `commands`"
+            yield Finding("warning", what, advice)
     scaled = (log.action - log.action.mean(axis=0)) / (log.action.std(axis=0) + 1e-9)
     values, directions = np.linalg.eigh(scaled.T @ scaled / len(scaled))
     if len(values) > 1 and values[0] < 0.02 * values[-1] and log.action.std(axis=0).min() > 0:

@@ -39,10 +39,8 @@ def save_grounding(path: Path, grounding: FittedGrounding, episodes: PairedEpiso
         raise BadInputError(f"fit returned a {type(grounding).__name__} with {wrong}: expected finite values")
     about = episodes.named | {"kind": grounding.kind}
     if taken := sorted(about.keys() & metadata):
-        raise BadInputError(
-            f"{type(grounding).__name__}.to_file: metadata of the names {', '.join(taken)}, which the package writes: "
-            "rename them"
-        )
+        name = f"{type(grounding).__name__}.to_file"
+        raise BadInputError(f"{name}: metadata of the names {', '.join(taken)}, which the package writes: rename them")
     save_tensors(path, tensors, about | metadata)
 
 

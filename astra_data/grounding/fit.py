@@ -87,14 +87,11 @@ class HistoryFit:
 
         task = fitting.task
         if self.reward and not fitting.training.has_rewards:
-            raise BadInputError(
-                f"{fitting.training.reference} has no {REWARD}, which the method predicts: take one "
-                "that does not, such as nas"
-            )
+            advice = "take one that does not, such as nas"
+            raise BadInputError(f"{fitting.training.reference} has no {REWARD}, which the method predicts: {advice}")
         predicts_failures = self.failures and has_failures(task, fitting.training)
-        training, held_out = (
-            self._rewarded(task, episodes, predicts_failures) for episodes in (fitting.training, fitting.held_out)
-        )
+        both = fitting.training, fitting.held_out
+        training, held_out = (self._rewarded(task, episodes, predicts_failures) for episodes in both)
         fitting = replace(fitting, training=training, held_out=held_out)
         corrects_reward = training.windows.own_reward is not None
         model, metrics = self._fitted(fitting, corrects_reward=corrects_reward)

@@ -112,10 +112,8 @@ class GroundingModel(nn.Module):
         fitted = {"state": shape.state_size, "goal": shape.goal_size, "action": shape.action_size}
         found = {name: getattr(episodes.windows, name).shape[-1] for name in fitted}
         if found != fitted:
-            raise BadInputError(
-                f"the grounding was fitted to values {fitted}, {episodes.reference} has {found}: run the stage "
-                "`ground` with this dataset"
-            )
+            fault = f"the grounding was fitted to values {fitted}, {episodes.reference} has {found}"
+            raise BadInputError(f"{fault}: run the stage `ground` with this dataset")
 
     def state_features(self, state: Tensor) -> Tensor:
         """Normalize abstract states (..., X) and append features of the robot's and the ball's position."""

@@ -46,10 +46,8 @@ def gap_report(task: Task, grounding: Grounding, episodes: PairedEpisodes, *, se
         for name, state in states.items():
             apart = distances(task, state - windows.next_state[episode, moments.after(horizon - 1)])
             if not apart.isfinite().all():
-                raise BadInputError(
-                    f"the {name} simulator of {task.name} diverges: its states are not finite in step "
-                    f"{horizon} of recorded commands: bound them in its `step`"
-                )
+                fault = f"its states are not finite in step {horizon} of recorded commands"
+                raise BadInputError(f"the {name} simulator of {task.name} diverges: {fault}: bound them in its `step`")
             errors[name][horizon] = apart
     rng = generator(seed, "gap bootstrap")
     report: dict[str, Any] = {"horizons": horizons, "replays": len(started[horizons[0]])}

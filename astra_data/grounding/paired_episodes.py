@@ -196,10 +196,8 @@ class PairedEpisodes:
         """Split into training and held-out episodes: as marked, else a share of recordings, with copies."""
         if self.held_out is not None:
             if self.held_out.all():
-                raise BadInputError(
-                    f"{self.reference}: expected episodes to train on, got {len(self)} that augmentation "
-                    "held out: take a larger subset"
-                )
+                got = f"{len(self)} that augmentation held out: take a larger subset"
+                raise BadInputError(f"{self.reference}: expected episodes to train on, got {got}")
             return self.select((~self.held_out).nonzero()[:, 0]), self.select(self.held_out.nonzero()[:, 0])
         names, each = self.recordings.unique(return_inverse=True)
         training, held_out = divided(self.reference, len(names), held_out_share, seed)

@@ -212,10 +212,8 @@ def transitions(experience: Experience, config: IqlConfig) -> Transitions:
     terminated = experience.terminated[rows]
     whole = (step + count <= lengths) | (terminated & (step < lengths))
     if not bool(whole.any()):
-        raise BadInputError(
-            f"expected an episode of at least {config.return_steps} steps (return_steps), or one that ends the task; "
-            f"the longest has {int(lengths.max())}"
-        )
+        least = f"at least {config.return_steps} steps (return_steps), or one that ends the task"
+        raise BadInputError(f"expected an episode of {least}; the longest has {int(lengths.max())}")
     columns = experience.observation, experience.action, summed, experience.next_observation[rows], terminated
     return Transitions(*(column[whole] for column in columns))
 

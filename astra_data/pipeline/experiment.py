@@ -124,10 +124,8 @@ class Experiment:
             self.base.check_unchanged()
         if self._outdated:
             folders = _outermost({place for key in self._outdated for place in self._made(key)}, self.folder)
-            raise RecipeError(
-                f"{' and '.join(dict.fromkeys(self._outdated.values()))} since {self.folder} was made: "
-                f"give the recipe another name, or remove {' '.join(map(str, folders))}"
-            )
+            changed = f"{' and '.join(dict.fromkeys(self._outdated.values()))} since {self.folder} was made"
+            raise RecipeError(f"{changed}: give the recipe another name, or remove {' '.join(map(str, folders))}")
 
     def outdated(self, key: str) -> str:
         """Return what changed since the artifact `key` was made or begun; empty if nothing."""

@@ -174,9 +174,8 @@ def first_simulator(logs: Logs) -> SimulatorKind:
         if not direct.entries:
             left_out = ", ".join(f"{one.name} ({one.why})" for one in logs.fields if one.role == "left out")
             without = f"; left out: {left_out}" if left_out else ""
-            raise BadInputError(
-                f"found no state that a command could move: name it as its command, cmd_q1 and q1{without}"
-            )
+            advice = f"name it as its command, cmd_q1 and q1{without}"
+            raise BadInputError(f"found no state that a command could move: {advice}")
         return direct
     rest = _direct(logs, good)
     merged = {name: getattr(good, name) + getattr(rest, name) for name in ("entries", "lines", "remarks")}

@@ -70,9 +70,8 @@ def _dataset(logs: Sequence[Path]) -> Dataset | None:
             raise BadInputError(f"{place}: no such file, folder or dataset{close}") from None
         folders += [folder] if folder != place or (folder / INFO_PATH).is_file() else []
     if folders and len(logs) > 1:
-        raise BadInputError(
-            f"{' and '.join(map(str, logs))}: expected logs, or one dataset: `astra-data merge` them first"
-        )
+        advice = "`astra-data merge` them first"
+        raise BadInputError(f"{' and '.join(map(str, logs))}: expected logs, or one dataset: {advice}")
     return Dataset.open(folders[0]) if folders else None
 
 

@@ -107,10 +107,8 @@ def check_unchanged(place: str, run: Path, *, name: str = "task") -> None:
     place = place_of(place) if name == "task" else place
     now = code_digest(place)
     if now and now != recorded_code(run).get(name, now):
-        raise BadInputError(
-            f"{place.rpartition(':')[0]} changed since {run} was made: "
-            "restore that version, or run the recipe under another name"
-        )
+        advice = "restore that version, or run the recipe under another name"
+        raise BadInputError(f"{place.rpartition(':')[0]} changed since {run} was made: {advice}")
 
 
 def digests_of(task: str, user_methods: Mapping[str, UserMethod]) -> dict[str, str]:
@@ -281,9 +279,8 @@ class Recipe(Config):
         with as_fault("select.judge: "):
             judge_of(self.select.judge, self.methods)
         if len(self.seeds) < 2:
-            raise ValueError(
-                "select: expected two seeds or more, got 1 (judges are of other seeds): remove [select], or add a seed"
-            )
+            fault = "expected two seeds or more, got 1 (judges are of other seeds)"
+            raise ValueError(f"select: {fault}: remove [select], or add a seed")
         if not any(method_named(row).trains_without_target for row in self.methods):
             raise ValueError("select: expected a row with policies of abstract states, got none")
         return self

@@ -92,17 +92,13 @@ def check_trials(run: str | Path, trials: int, *, by_hand: bool, field: int | No
     folder, settings = Path(run), settings_of(run)
     task, sizes = task_named(str(settings["task"])), settings.get("sweep", {}).get("percent") or [None]
     if not by_hand and not task.has_target:
-        raise BadInputError(
-            f"{folder}: expected a task with a target, got {settings['task']}: leave out --trials, or make "
-            "them at the robot, with --by-hand"
-        )
+        advice = "leave out --trials, or make them at the robot, with --by-hand"
+        raise BadInputError(f"{folder}: expected a task with a target, got {settings['task']}: {advice}")
     if field is not None and field < 2:
         raise BadInputError(f"--field: expected 2 candidates or more, got {field}")
     if trials < (least := choice.least_trials(field or 2)):
-        raise BadInputError(
-            f"expected --trials of {least} or more, for a first round of {field or 2} candidates and those "
-            f"after it, got {trials}: give more, or another --field"
-        )
+        first = f"for a first round of {field or 2} candidates and those after it, got {trials}"
+        raise BadInputError(f"expected --trials of {least} or more, {first}: give more, or another --field")
     if percent not in sizes:
         known = ", ".join(f"{size}" for size in sizes if size) or "none"
         raise BadInputError(f"expected --percent to be a size of the run ({known}), got {percent or 'none'}")
@@ -138,10 +134,8 @@ def choose_by_trials(
     if there := found_json(choice.Trials, path):
         for name, now in settings.items():
             if (was := getattr(there, name)) != now:
-                raise BadInputError(
-                    f"{path}: expected trials with {name} = {now}, found {there.spent} made with {was}: "
-                    f"use the same settings, or move {path.parent} away"
-                )
+                found = f"{there.spent} made with {was}: use the same settings, or move {path.parent} away"
+                raise BadInputError(f"{path}: expected trials with {name} = {now}, found {found}")
     rounds = list(there.rounds) if there else []  # of which nothing is tried again
     begun, shown = choice.Trials(**settings, rounds=rounds), part(progress, 0.5, 1.0)  # results may have been corrected
     sheet = Sheet(path.parent / choice.SHEET, task)
@@ -179,10 +173,8 @@ def choose_by_trials(
         if number == len(rounds):
             rounds.append(choice.TrialRound(trials=each, candidates=named))
         if {*rounds[number].candidates} != {*named}:
-            raise BadInputError(
-                f"{sheet.path}: expected the results that round {number + 1} was planned for, found others in an "
-                f"earlier round: restore them, or move {path.parent} away to begin anew"
-            )
+            expected = f"expected the results that round {number + 1} was planned for, found others in an earlier round"
+            raise BadInputError(f"{sheet.path}: {expected}: restore them, or move {path.parent} away to begin anew")
         if by_hand is not None:
             at_robot(number, those, by_hand)
         for row, seed in named[len(rounds[number].tried) :]:

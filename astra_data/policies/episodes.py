@@ -290,10 +290,8 @@ class Reached(NamedTuple):
 def reached_in_own_world(task: Task, trained: PolicyFile, grounding: Grounding, seed: int) -> Reached:
     """Test a policy in the simulator of its training, from the task's starts, by the mean of its actions."""
     if trained.simulation is None:
-        raise BadInputError(
-            "tries: expected a policy that knows its simulator, got one without: give PolicyFile its "
-            "simulation, or set tries = 1"
-        )
+        advice = "give PolicyFile its simulation, or set tries = 1"
+        raise BadInputError(f"tries: expected a policy that knows its simulator, got one without: {advice}")
     policy, horizon = running(task, trained, grounding), task.objective.horizon
     world = training_env(task, trained.simulation, grounding, num_envs=_EPISODES)
     begin = partial(started, policy, policy.act_in_simulator)

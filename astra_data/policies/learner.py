@@ -45,9 +45,8 @@ KINDS: dict[str, type[SavedPolicy]] = {}
 def add_policy_kind(made: type[SavedPolicy]) -> None:
     """Let files hold policies of another learner."""
     if made.kind in PACKAGE_KINDS or KINDS.setdefault(made.kind, made) is not made:
-        raise BadInputError(
-            f"policies of kind '{made.kind}' are the package's or another learner's: rename that of {made.__name__}"
-        )
+        advice = f"rename that of {made.__name__}"
+        raise BadInputError(f"policies of kind '{made.kind}' are the package's or another learner's: {advice}")
 
 
 class Learner(ABC):

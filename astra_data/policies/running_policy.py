@@ -245,8 +245,6 @@ def running(
     limit = trained.simulation.world.command_limit if trained.simulation else NO_LIMIT
     made = RunningPolicy(task, trained.policy, grounding.encoder, target_encoder, limit, trained.observed, sensing)
     if made.observation_size != (taken := trained.policy.shape.observation_size):
-        raise BadInputError(
-            f"the policy takes {taken} values, {task.name} gives {made.observation_size}: expected a "
-            "policy of this task and, if it was trained in a grounded simulator, its grounding"
-        )
+        expected = "expected a policy of this task and, if it was trained in a grounded simulator, its grounding"
+        raise BadInputError(f"the policy takes {taken} values, {task.name} gives {made.observation_size}: {expected}")
     return made

@@ -175,10 +175,8 @@ class SimulatorEnv:
         if not bool(made.isfinite().all()):
             row = int((~made.isfinite()).view(len(made), -1).any(1).nonzero()[0])
             wrong = float(made[~made.isfinite()][0])
-            raise BadInputError(
-                f"{maker}: expected finite numbers, got {wrong:g} for the abstract state "
-                f"{self.simulator.state[row].tolist()} and the goal {self.goal[row].tolist()}"
-            )
+            where = f"the abstract state {self.simulator.state[row].tolist()} and the goal {self.goal[row].tolist()}"
+            raise BadInputError(f"{maker}: expected finite numbers, got {wrong:g} for {where}")
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return all that `load_state_dict` needs to continue from here."""

@@ -335,11 +335,10 @@ def _datasets(sources: Sequence[Results]) -> list[DatasetUse]:
         content = one.content_hash if one.stage == "evaluate" else ""
         first = known.setdefault((one.stage, one.seed, content), one)
         if first.content_hash != one.content_hash:
-            raise BadInputError(
-                f"{sources[-1].recipe}: expected all merged results to use the same data, got those of "
-                f"{one.stage} seed {one.seed} with content {first.content_hash} and {one.content_hash}: "
-                "processors round differently, so run all rows of a seed on one"
-            )
+            got = f"those of {one.stage} seed {one.seed} with content {first.content_hash} and {one.content_hash}"
+            fault = f"expected all merged results to use the same data, got {got}"
+            advice = "processors round differently, so run all rows of a seed on one"
+            raise BadInputError(f"{sources[-1].recipe}: {fault}: {advice}")
     return [*known.values()]
 
 

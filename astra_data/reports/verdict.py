@@ -165,10 +165,8 @@ def _lost(results: Results, row: str) -> Iterator[str]:
         of = errors.loc[grounding].unstack("simulator")
         at = of.xs(judged_horizon(of.index.get_level_values("horizon")), level="horizon")
         if worse := [f"`{quantity}`" for quantity in at.index[at["grounded"] >= at["raw"]]]:
-            yield (
-                f"{title}: on held-out episodes its correction is no better than none in {listed(worse)}: "
-                "record more episodes, or longer ones."
-            )
+            fault = f"on held-out episodes its correction is no better than none in {listed(worse)}"
+            yield f"{title}: {fault}: record more episodes, or longer ones."
 
 
 def _limits(results: Results, worth: Mapping[str, Estimate], best: str) -> Iterator[str]:
@@ -188,10 +186,8 @@ def _limits(results: Results, worth: Mapping[str, Estimate], best: str) -> Itera
             values = " and ".join(map("{:.4g}".format, means))
             yield f"{method_title(best)} and {method_title(row)} are compared {on}: {values}{more}."
     if choice and results.tested_in == "target" and choice.best.row != best:
-        yield (
-            f"Without the target, the judges (simulators that did not train a policy) choose "
-            f"{choice.best.name}, with a predicted success of {choice.best.predicted:.2f}."
-        )
+        chosen = f"{choice.best.name}, with a predicted success of {choice.best.predicted:.2f}"
+        yield f"Without the target, the judges (simulators that did not train a policy) choose {chosen}."
     if unjudged := [method_title(row) for row in results.contenders() if row not in worth]:
         yield f"Not judged, so not compared: {', '.join(unjudged)}."
 

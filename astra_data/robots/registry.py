@@ -80,9 +80,8 @@ def pairing_named(name: str) -> Pairing:
         return Pairing(made.simulator_id, origin, *about, (made.state, made.action))
     needed = ("abstract_state", "abstraction", "parameters", "reset_to", "step")
     if missing := [attribute for attribute in needed if not hasattr(made, attribute)]:
-        raise BadInputError(
-            f"{name} has no {', '.join(missing)}: expected what a Simulator has, see astra_data.worlds.protocols"
-        )
+        expected = "expected what a Simulator has, see astra_data.worlds.protocols"
+        raise BadInputError(f"{name} has no {', '.join(missing)}: {expected}")
     column = made.abstract_state
     if not isinstance(column, Column):
         raise BadInputError(f"{name}.abstract_state is a {type(column).__name__}, expected a Column")
@@ -109,7 +108,6 @@ def checked_abstraction(pairing: Pairing, state: Array) -> Array:
     with explained(f"the abstraction of {pairing.id}, given states {state.shape},"):
         abstract = np.ascontiguousarray(pairing.abstraction(state), dtype=np.float32)
     if abstract.shape != expected:
-        raise BadInputError(
-            f"the abstraction of {pairing.id} makes {abstract.shape} of states {state.shape}, expected {expected}"
-        )
+        made = f"{abstract.shape} of states {state.shape}"
+        raise BadInputError(f"the abstraction of {pairing.id} makes {made}, expected {expected}")
     return abstract

@@ -22,10 +22,8 @@ _ADVICE = "give GymnasiumRobot a command, a function of a command and a state th
 def observed(env: Env, observation: Any) -> State:  # noqa: ANN401 - whatever the environment shows
     """Return the observation as the robot's state; of a `GoalEnv` its entry "observation"."""
     if isinstance(observation, dict) and "observation" not in observation:
-        raise BadInputError(
-            f"the environment shows {', '.join(observation)}: give GymnasiumRobot a read_state, a function "
-            "of the environment and what it shows that returns the state (S,)"
-        )
+        wanted = "a read_state, a function of the environment and what it shows that returns the state (S,)"
+        raise BadInputError(f"the environment shows {', '.join(observation)}: give GymnasiumRobot {wanted}")
     shown = observation["observation"] if isinstance(observation, dict) else observation
     return np.asarray(shown, dtype=np.float64)
 
@@ -111,10 +109,9 @@ class GymnasiumRobot:
             beyond = np.flatnonzero((action < self._least) | (action > self._largest))
             if len(beyond):
                 low, high, given = (float(np.ravel(of)[beyond[0]]) for of in (space.low, space.high, action))
-                raise BadInputError(
-                    f"{self.name} takes actions of {low:g} to {high:g} in entry {beyond[0]}, and the command "
-                    f"is {given:g}: narrow the task's commands, or {_ADVICE}"
-                )
+                taken = f"actions of {low:g} to {high:g} in entry {beyond[0]}"
+                found = f"the command is {given:g}: narrow the task's commands, or {_ADVICE}"
+                raise BadInputError(f"{self.name} takes {taken}, and {found}")
         return action
 
 
@@ -146,9 +143,8 @@ class GymnasiumSimulator(NumpySimulator):
         def step_each(states: Floats, commands: Floats) -> Floats:
             nonlocal is_checked
             if env.action_space.shape != commands.shape[1:]:
-                raise BadInputError(
-                    f"{env_id}: expected as many commands as actions, {env.action_space}: got {commands.shape[1]}"
-                )
+                expected = f"expected as many commands as actions, {env.action_space}"
+                raise BadInputError(f"{env_id}: {expected}: got {commands.shape[1]}")
             landed = np.empty_like(states)
             for row, (state, command) in enumerate(zip(states, commands, strict=True)):
                 write(inner, state)

@@ -375,10 +375,8 @@ class Task:
     def maze(self) -> Maze:
         """The maze; BadInputError where there is none."""
         if self.plane is None:
-            raise BadInputError(
-                f"expected a task in a maze, got '{self.name}', which has none: leave out what needs a maze "
-                "(augment, follower, clearance_m, start 'anywhere')"
-            )
+            advice = "leave out what needs a maze (augment, follower, clearance_m, start 'anywhere')"
+            raise BadInputError(f"expected a task in a maze, got '{self.name}', which has none: {advice}")
         return self.plane
 
     @property
@@ -399,10 +397,8 @@ class Task:
             with explained(f"make_target(objective, {num_envs}, {given})"):
                 return self.make_target(self.objective, num_envs, **options)
         if self.robot is None:
-            raise BadInputError(
-                f"task '{self.name}' has no target: give it a `robot`, or leave out what needs one (collect, "
-                "rows trained in the target)"
-            )
+            advice = "give it a `robot`, or leave out what needs one (collect, rows trained in the target)"
+            raise BadInputError(f"task '{self.name}' has no target: {advice}")
         return RobotEnv(self, num_envs, **options)
 
     def own_simulator(self, num_envs: int, device: str = "cpu") -> AbstractSimulator:

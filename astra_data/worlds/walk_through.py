@@ -90,10 +90,8 @@ def _abstraction(task: Task) -> None:
         found = answered(what, task.abstraction, given)
         shape = tuple(getattr(found, "shape", ()))
         if not isinstance(found, type(given)) or shape != wanted:
-            raise BadInputError(
-                f"{what}: expected a {type(given).__name__} of shape {wanted}, got a {type(found).__name__} "
-                f"of {shape}; abstract_state has {wanted[1]} values"
-            )
+            got = f"a {type(found).__name__} of {shape}; abstract_state has {wanted[1]} values"
+            raise BadInputError(f"{what}: expected a {type(given).__name__} of shape {wanted}, got {got}")
         expect(what, answered(what, torch.as_tensor, found), wanted)
 
 
@@ -154,10 +152,8 @@ def _moved(task: Task, simulator: AbstractSimulator, starts: Tensor) -> Tensor:
         if not torch.allclose(shown, expected, rtol=_TOLERANCE, atol=_TOLERANCE):
             apart = (shown - expected).abs()
             row, entry = (apart == apart.max()).nonzero()[0].tolist()
-            raise BadInputError(
-                f"{what}: expected {float(expected[row, entry]):g} in row {row}, entry {entry}, got "
-                f"{float(shown[row, entry]):g}"
-            )
+            wanted, got = (float(of[row, entry]) for of in (expected, shown))
+            raise BadInputError(f"{what}: expected {wanted:g} in row {row}, entry {entry}, got {got:g}")
     drawn = generator(0, "actions").uniform(-1.0, 1.0, (_COUNT, len(task.limits)))
     command = task.limits.in_units(torch.from_numpy(drawn).float()).to(starts.device)
     what = "make_simulator: step(command)"

@@ -270,10 +270,8 @@ class CollectConfig(Config):
     @model_validator(mode="after")
     def _fits_a_disk(self) -> Self:
         if self.episodes * self.max_steps > MOST_STEPS:
-            raise ValueError(
-                f"episodes: {self.episodes} of up to {self.max_steps} steps take terabytes: expected at most "
-                f"{MOST_STEPS} steps in total"
-            )
+            fault = f"{self.episodes} of up to {self.max_steps} steps take terabytes"
+            raise ValueError(f"episodes: {fault}: expected at most {MOST_STEPS} steps in total")
         return self
 
 

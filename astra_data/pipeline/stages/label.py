@@ -166,9 +166,8 @@ def check_fits(source: Dataset, task: Task) -> None:
         faults += column_faults(source, expected, task.name)
     goal_size = task.goal.size if task.goal else 0
     if names.GOAL in source.features and (found := source.features[names.GOAL]["shape"][0]) != goal_size:
-        faults.append(
-            f"{names.GOAL} has {found} values, goals of {task.name} have {goal_size}: import it without that column"
-        )
+        fault = f"has {found} values, goals of {task.name} have {goal_size}"
+        faults.append(f"{names.GOAL} {fault}: import it without that column")
     if names.NEXT_STATE not in source.features:
         faults.append(f"has no column {names.NEXT_STATE}")
     if faults:

@@ -96,10 +96,8 @@ def pair(
     for unit, half in (("rad", "π"), ("deg", "180°")):
         jumped = [entry for entry, rows in enumerate(jumps[unit]) if rows and turns[entry] == TURNS[unit]]
         if wrapped := [f"{_name(pairing, entry)} in {jumps[unit][entry]} of {steps} rows" for entry in jumped]:
-            _log.warning(
-                f"{pairing.id} lands more than {half} from where the robot was: {', '.join(wrapped)}; "
-                "a heading that wraps: make cos and sin of it in φ"
-            )
+            found = f"{', '.join(wrapped)}; a heading that wraps: make cos and sin of it in φ"
+            _log.warning(f"{pairing.id} lands more than {half} from where the robot was: {found}")
     return writer.root
 
 
@@ -141,10 +139,9 @@ def pair_steps(
             raise BadInputError(f"step of {pairing.id} returns shape {reached.shape}, expected {tuple(wanted.shape)}")
         if not np.isfinite(reached).all():
             row, entry = np.argwhere(~np.isfinite(reached))[0]
-            raise BadInputError(
-                f"the simulator, stepped from φ(s) of step {first_step + rows[row]}, gives {_name(pairing, entry)} = "
-                f"{reached[row, entry]}: expected finite states from its step"
-            )
+            where = f"stepped from φ(s) of step {first_step + rows[row]}"
+            got = f"{_name(pairing, entry)} = {reached[row, entry]}"
+            raise BadInputError(f"the simulator, {where}, gives {got}: expected finite states from its step")
         landed[first : first + size] = reached[: len(state) - first]
     columns = {
         keys.ABSTRACT_STATE: abstract,
@@ -163,10 +160,8 @@ def _check(source: Dataset, pairing: Pairing) -> None:
     task = source.description["environment"].get("id")
     known = TASKS.get(task)
     if pairing.maze is not None and known and known.plane not in (None, pairing.maze):
-        raise BadInputError(
-            f"{source.reference} was collected for {task}, which has another maze than "
-            f"{pairing.origin['task']}: give --simulator {task}"
-        )
+        fault = f"was collected for {task}, which has another maze than {pairing.origin['task']}"
+        raise BadInputError(f"{source.reference} {fault}: give --simulator {task}")
     faults = [f"no column {name}" for name in (keys.STATE, keys.ACTION, keys.NEXT_STATE) if name not in source.features]
     if keys.ABSTRACT_STATE in source.features:
         faults.append(f"{keys.ABSTRACT_STATE} already: it is paired")

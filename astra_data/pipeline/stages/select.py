@@ -79,9 +79,8 @@ def judge_of(judge: str | None, rows: Sequence[str]) -> str:
     grounding = (row for row in rows if method_named(row).grounds)
     asked = judge or reference_of(rows) or next(grounding, None)
     if asked is None or not method_named(asked).grounds:
-        raise BadInputError(
-            f"expected a row that grounds its simulator, such as nas or astra, as judge, got {asked or 'none'}"
-        )
+        expected = "expected a row that grounds its simulator, such as nas or astra, as judge"
+        raise BadInputError(f"{expected}, got {asked or 'none'}")
     return grounded_as(asked)
 
 
@@ -134,10 +133,9 @@ def select(recipe: Reported, config: SelectConfig = SelectConfig(), *, root: Pat
             named = ", ".join(recipe.methods)
             raise BadInputError(f"{root}: found no policy of {named}{size}: run the recipe until train first")
         if len(bench.judges) < 2:
-            raise BadInputError(
-                f"{root}: expected groundings of {judge} for two seeds or more{size}, found {len(bench.judges)}: "
-                "groundings of other episodes judge a policy: add seeds to the recipe and run it"
-            )
+            advice = "groundings of other episodes judge a policy: add seeds to the recipe and run it"
+            fault = f"expected groundings of {judge} for two seeds or more{size}, found {len(bench.judges)}"
+            raise BadInputError(f"{root}: {fault}: {advice}")
     made_from, stopwatch = digests(contests, root), Stopwatch()
     total, found = sum(len(bench.entries) for bench in contests), list[Candidate]()
     settings_text = config.model_dump_json(indent=1)

@@ -225,9 +225,7 @@ def _skeleton(dtype: "torch.dtype", device: "torch.device") -> _Skeleton:
         return torch.as_tensor(np.array(values), dtype=dtype, device=device)
 
     parents = model.body_parentid.tolist()
-    joints = [
-        range(first, first + count) for first, count in zip(model.body_jntadr - 1, model.body_jntnum, strict=True)
-    ]
+    joints = [range(at, at + count) for at, count in zip(model.body_jntadr - 1, model.body_jntnum, strict=True)]
     turns, moved = np.zeros((model.nbody, 9)), np.zeros((len(JOINTS), len(bodies)))
     shares = model.body_mass[bodies] / model.body_mass.sum()
     for body, share in zip(bodies, shares, strict=True):

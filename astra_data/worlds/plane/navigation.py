@@ -61,10 +61,8 @@ class Navigation(PlanarObjective):
     def __post_init__(self) -> None:
         farthest = 3 * self.spread_m + self.path_clearance_m
         if farthest >= self.maze.scale / 2:
-            raise BadInputError(
-                f"expected goals within their cell of {self.maze.scale:g} m, got 3 spread_m + "
-                f"path_clearance_m = {farthest:g} m around its center: take a smaller spread_m"
-            )
+            got = f"3 spread_m + path_clearance_m = {farthest:g} m around its center: take a smaller spread_m"
+            raise BadInputError(f"expected goals within their cell of {self.maze.scale:g} m, got {got}")
 
     def draw_starts(self, rng: np.random.Generator, count: int) -> Floats:
         """Draw states [x, y, vx, vy] (count, 4) at rest around the usual starts."""
@@ -80,10 +78,8 @@ class Navigation(PlanarObjective):
         """Draw states [x, y, vx, vy] (count, 4) at rest, uniformly from the free space away from walls."""
         rows, columns = np.nonzero(self.maze.clearance_field > self.start_clearance_m)
         if not len(rows):
-            raise BadInputError(
-                f"start_clearance_m: expected less than {self.maze.clearance_field.max():.3g} m, the largest "
-                f"clearance in the maze, got {self.start_clearance_m:g}"
-            )
+            most = f"{self.maze.clearance_field.max():.3g} m, the largest clearance in the maze"
+            raise BadInputError(f"start_clearance_m: expected less than {most}, got {self.start_clearance_m:g}")
         chosen = rng.integers(len(rows), size=count)
         cell = self.maze.half_extent * 2 / self.maze.fine_walls.shape[::-1]
         within = rng.random((count, 2))
@@ -184,15 +180,11 @@ class PlanarStates(FreeStates):
     ) -> None:
         """Put B of them at rest at the origin, `radius_m` from walls, `speed_m_s` fast along each axis."""
         if abs(radius_m / maze.fine_m - round(radius_m / maze.fine_m)) > _CELLS_APART:
-            raise BadInputError(
-                f"radius_m: expected a multiple of the maze's fine_m, {maze.fine_m} m, got {radius_m}: "
-                "take another radius, or a finer maze"
-            )
+            expected = f"expected a multiple of the maze's fine_m, {maze.fine_m} m, got {radius_m}"
+            raise BadInputError(f"radius_m: {expected}: take another radius, or a finer maze")
         if (way_m := timestep_s * speed_m_s) > maze.scale / 2:
-            raise BadInputError(
-                f"speed_m_s: expected steps of {maze.scale / 2:g} m, half a cell of the maze, or shorter, got "
-                f"{way_m:g} m: longer ones pass through walls"
-            )
+            expected = f"expected steps of {maze.scale / 2:g} m, half a cell of the maze, or shorter"
+            raise BadInputError(f"speed_m_s: {expected}, got {way_m:g} m: longer ones pass through walls")
         self.parameters = {"timestep_s": timestep_s, "radius_m": radius_m, "speed_m_s": speed_m_s}
         self.free = free_space(maze, radius_m=radius_m, device=device)
         self._maze = maze
