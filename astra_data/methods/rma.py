@@ -52,10 +52,15 @@ class Adaptation(Learner):
         self.student = Student.of_teacher(teacher)
         learned = [parameter for parameter in self.student.parameters() if parameter.requires_grad]
         self._optimizer = torch.optim.Adam(learned, lr=config.adaptation_learning_rate)
-        hidden = self.student.initial_hidden(env.num_envs)
-        parts = {"student": self.student, "optimizer": self._optimizer}
-        steps: dict[str, Any] = {"total_steps": config.adaptation_steps, "rollout_steps": rollout_steps}
-        super().__init__(env, hidden, parts, horizon=horizon, seed=derive(seed, "adaptation"), **steps)
+        super().__init__(
+            env,
+            self.student.initial_hidden(env.num_envs),
+            {"student": self.student, "optimizer": self._optimizer},
+            horizon=horizon,
+            total_steps=config.adaptation_steps,
+            rollout_steps=rollout_steps,
+            seed=derive(seed, "adaptation"),
+        )
 
     def _iterate(self) -> dict[str, float]:
         """Take `rollout_steps` batched steps, learning after each; return the estimates' R² as "r2_extrinsics"."""

@@ -90,10 +90,19 @@ def _world(
         raise BadInputError(f"Grounded-v0: unknown option '{unknown[0]}'{did_you_mean(unknown[0], OPTIONS)}")
     changed = {"methods": [row], "seeds": [seed], "train": settings.get("train", {}) | options}
     train = _planned(run, settings | changed, "train", row, seed, percent).keywords
-    task, episodes = task_named(train["task"]), PairedEpisodes.load(train["dataset"])
-    grounding = grounding_at(train["grounding"] and train["grounding"] / GROUNDING)
-    given = task, train["config"], train["settings"], episodes, grounding
-    training = Training(*given, None, seed, "cpu", Path(run), silent, is_plus=is_plus(row))
+    training = Training(
+        task=task_named(train["task"]),
+        config=train["config"],
+        settings=train["settings"],
+        episodes=PairedEpisodes.load(train["dataset"]),
+        grounding=grounding_at(train["grounding"] and train["grounding"] / GROUNDING),
+        initial=None,
+        seed=seed,
+        device="cpu",
+        folder=Path(run),
+        progress=silent,
+        is_plus=is_plus(row),
+    )
     return *learn.world(training), training
 
 

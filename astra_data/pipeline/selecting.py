@@ -63,9 +63,15 @@ def asked_of(
     add_all(settings.get("user_methods", {}))
     asked = (settings.get("select") or {}) | only_given(judge=judge, episodes=episodes)
     config = validated(asked, SelectConfig, f"{folder}: select")
-    methods, sizes = tuple(rows or settings["methods"]), tuple(settings.get("sweep", {}).get("percent", ()))
-    about: dict[str, Any] = {"name": folder.name, "task": settings["task"], "settings": settings}
-    return Reported(methods, tuple(settings["seeds"]), sizes, **about), config
+    recipe = Reported(
+        name=folder.name,
+        task=settings["task"],
+        methods=tuple(rows or settings["methods"]),
+        seeds=tuple(settings["seeds"]),
+        settings=settings,
+        percents=tuple(settings.get("sweep", {}).get("percent", ())),
+    )
+    return recipe, config
 
 
 def _is_current(folder: Path, recipe: Reported, config: SelectConfig) -> bool:

@@ -1,7 +1,7 @@
 """Proximal policy optimization (Schulman et al. 2017) on a batched environment."""
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from astra_data.core.arrays import gaussian_log_prob
 from astra_data.core.config import Config, Count, Positive, Share
@@ -62,9 +62,15 @@ class Ppo(Learner):
         self._returns = ReturnScale(env.num_envs, config.discount).to(policy.log_std.device)
         self._segment_steps = math.gcd(config.rollout_steps, _SEGMENT_STEPS)
         torch.manual_seed(derive(seed, "first reset"))
-        parts = {"policy": policy, "optimizer": self._optimizer, "returns": self._returns}
-        steps: dict[str, Any] = {"total_steps": config.total_steps, "rollout_steps": config.rollout_steps}
-        super().__init__(env, policy.initial_hidden(env.num_envs), parts, horizon=horizon, seed=seed, **steps)
+        super().__init__(
+            env,
+            policy.initial_hidden(env.num_envs),
+            {"policy": policy, "optimizer": self._optimizer, "returns": self._returns},
+            horizon=horizon,
+            total_steps=config.total_steps,
+            rollout_steps=config.rollout_steps,
+            seed=seed,
+        )
 
     def _iterate(self) -> dict[str, float]:
         """Collect one rollout and learn from it; return the mean "std" of the actions."""

@@ -309,9 +309,16 @@ def collect(
         "seeds": {"collect": seed, "subset": derive(seed, "subset")},
         "environment": {"id": world.name, "timestep_s": world.timestep_s, **world.facts},
     }
-    folder, columns = out or home_of(description), [*world.state_columns, *OUTCOME_COLUMNS]
-    about: dict[str, Any] = {"fps": world.fps, "task": world.instruction, "subset_seed": derive(seed, "subset")}
-    with StagedWriter(folder, columns, **about, description=description, resume=resume) as writer:
+    folder = out or home_of(description)
+    with StagedWriter(
+        folder,
+        [*world.state_columns, *OUTCOME_COLUMNS],
+        fps=world.fps,
+        task=world.instruction,
+        description=description,
+        subset_seed=derive(seed, "subset"),
+        resume=resume,
+    ) as writer:
         share = _TRAINING_SHARE if config.behavior.startswith("suboptimal") else 0.0
         training = part(progress, 0.0, share)
         behavior, metadata = _behavior(world, config, seed, writer, num_threads, training)

@@ -80,8 +80,20 @@ def train(
     settings_text = as_json(**named, **sums, seed=seed, train=config, settings=settings)
     read = {"dataset": episodes.content_hash, "grounding": grounding_digest, "initial": initial_digest}
     with finished_folder(out, config=settings_text, made_from=read) as folder:
-        given = world, config, settings, episodes, correction, beginning, seed, device, folder, progress
-        training = Training(*given, num_threads=num_threads, is_plus=is_plus(method))
+        training = Training(
+            task=world,
+            config=config,
+            settings=settings,
+            episodes=episodes,
+            grounding=correction,
+            initial=beginning,
+            seed=seed,
+            device=device,
+            folder=folder,
+            progress=progress,
+            num_threads=num_threads,
+            is_plus=is_plus(method),
+        )
         learn = partial(_learned, base.learn)
         if base.in_simulator:
             policy, curve = with_restarts(learn, training, grounding_file)
