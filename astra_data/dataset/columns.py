@@ -9,8 +9,9 @@ A column with one value per step has shape (T,), all others (T, size): never (T,
 import hashlib
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +43,11 @@ ROLES = {"position": 2, "vector": 2, "heading": 1, "quaternion": 4, "invariant":
 """How a change of the planar frame acts on values (see `Column.astra`), and on how many of them at once."""
 Array = NDArray[Any]
 Scalar = float | int | bool | str
+
+
+def is_text(value: object) -> TypeGuard[str]:
+    """Return whether `value` is a text that can be written as UTF-8; names of files that are not UTF-8 cannot."""
+    return isinstance(value, str) and not any("\ud800" <= character <= "\udfff" for character in value)
 
 
 @dataclass(frozen=True)
@@ -76,7 +82,7 @@ class Column:
 
     def __post_init__(self) -> None:
         size, names, astra = self.size, self.names, self.astra or {}
-        words = astra.get("role", [])
+        words, texts = astra.get("role", []), [*(names or ()), self.meaning, *chain(*astra.values())]
         unknown = ", ".join(sorted(set(words) - set(ROLES)))
         is_named = 1 <= len(self.name.encode(errors="replace")) <= MOST_NAME_BYTES
         is_file = self.name not in (".", "..") and {"/", "\0"}.isdisjoint(self.name)
@@ -85,6 +91,7 @@ class Column:
             f"dtype {self.dtype!r} is not one of {', '.join(DTYPES)}": self.dtype in DTYPES,
             f"size {size}, expected 1 to {MOST_VALUES}": 1 <= size <= MOST_VALUES,
             f"{len(names or ())} names for {size} values": names is None or len(names) == size,
+            "expected texts of valid characters in names, meaning and astra": all(map(is_text, texts)),
             **{f"astra has {key!r}, expected unit, frame, role": key in ("unit", "frame", "role") for key in astra},
             **{f"{len(of)} words in astra's {key} for {size} values": len(of) == size for key, of in astra.items()},
             f"unknown role {unknown}, expected {', '.join(ROLES)}": not unknown,
@@ -249,13 +256,8 @@ def _column_faults(name: str, values: Array) -> list[str]:
     return faults
 
 
-def is_text(value: str) -> bool:
-    """Return whether `value` can be written as UTF-8; names of files that are not UTF-8 cannot."""
-    return not any("\ud800" <= character <= "\udfff" for character in value)
-
-
 def _metadata_faults(key: object, value: object) -> Iterator[str]:
-    if not isinstance(key, str) or not is_text(key) or not 0 < len(key) <= MOST_CHARACTERS:
+    if not is_text(key) or not 0 < len(key) <= MOST_CHARACTERS:
         yield f"metadata {key!r:.80}: expected a text of valid characters as its name"
     elif not isinstance(value, Scalar):
         yield f"metadata {key}: {type(value).__name__}, expected float, int, bool or str"

@@ -175,5 +175,4 @@ def _episodes(root: Path) -> list[str]:
 
 def _sum_of(description: Mapping[str, Any]) -> str:
     sums = {path: value for path, value in description["sums"].items() if path != layout.DATASET_PATH}
-    text = json.dumps({**description, "sums": sums}, sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()
+    return hashlib.sha256(json.dumps({**description, "sums": sums}, sort_keys=True).encode()).hexdigest()

@@ -79,7 +79,7 @@ class DatasetWriter:
             **{f"column {name}: is filled in by the writer, leave it out": False for name in reserved},
             "no columns": bool(given),
             f"fps {fps!r}, expected a positive int": type(fps) is int and fps >= 1,
-            f"task {task!r}, expected text of valid characters": isinstance(task, str) and is_text(task),
+            f"task {task!r}, expected text of valid characters": is_text(task),
         }
         around = [folder for folder in root.absolute().parents if (folder / layout.INFO_PATH).is_file()]
         checks |= {f"expected a folder outside of the dataset {folder}": False for folder in around}

@@ -27,6 +27,9 @@ def test_a_column_that_contradicts_itself_is_refused_with_every_fault() -> None:
     message = str(caught.value)
     for part in ("'/'", "float16", "1 names for 2", "1 words in astra's unit", "unknown role pos", "has 'x'"):
         assert part in message
+    for given in ({"names": (1,)}, {"meaning": 1}, {"astra": {"unit": [1]}}, {"names": ("\ud800",)}):
+        with pytest.raises(BadInputError, match="expected texts of valid characters in names, meaning and astra"):
+            keys.Column("a", **given)
     for name in ("", ".", "..", "a\0", 201 * "a"):
         with pytest.raises(BadInputError, match="the name must have 1 to 200 bytes, without '/', and name a file"):
             keys.Column(name)

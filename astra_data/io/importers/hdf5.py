@@ -77,8 +77,7 @@ def layout(source: Source) -> dict[str, Any]:
         if {"observations", "actions"} <= fields.keys():
             columns = {name: {"fields": [field]} for name, field in D4RL.items() if field in fields}
             stacked = {fields[field].shape[:2] for field in ("observations", "actions")}
-            is_stacked = len(stacked) == 1 and fields["actions"].ndim == 3
-            return {"columns": columns, "stacked": is_stacked}
+            return {"columns": columns, "stacked": len(stacked) == 1 and fields["actions"].ndim == 3}
         if {"num_episodes", "observations_0", "actions_0"} <= fields.keys():
             columns = {name: {"fields": [field]} for name, field in D3RLPY.items() if f"{field}_0" in fields}
             return {"columns": columns, "episodes": NUMBERED}
