@@ -246,6 +246,4 @@ def _dotted_keys(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
 def _with_tuples(value: object) -> object:
     if isinstance(value, dict):
         return {key: _with_tuples(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return tuple(_with_tuples(item) for item in value)
-    return value
+    return tuple(_with_tuples(item) for item in value) if isinstance(value, list) else value

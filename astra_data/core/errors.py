@@ -43,8 +43,7 @@ _LONGEST = 300  # characters of an error message of a library that are shown
 
 def in_short(error: Exception) -> str:
     """Return the first sentence of an error message, of bounded length and printable."""
-    line = str(error).split("\n")[0].split(". ")[0].rstrip(".:")
-    return shortened(printable(line), _LONGEST)
+    return shortened(printable(str(error).split("\n")[0].split(". ")[0].rstrip(".:")), _LONGEST)
 
 
 def unmet(checks: Mapping[str, object]) -> list[str]:

@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 
 def derive(seed: int, purpose: str) -> int:
     """Return the seed of `purpose`, in [0, 2^63)."""
-    digest = hashlib.sha256(f"{seed}/{purpose}".encode()).digest()
-    return int.from_bytes(digest[:8], "big") >> 1
+    return int.from_bytes(hashlib.sha256(f"{seed}/{purpose}".encode()).digest()[:8], "big") >> 1
 
 
 def generator(seed: int, purpose: str) -> np.random.Generator:

@@ -199,9 +199,7 @@ def usual_periods(moments: Mapping[str, Ints], gap_ns: int) -> dict[str, float]:
 def _messages_per_row(ratio: float) -> int:
     """Return the whole number that `ratio` is about, 1 where its inverse is, else 0."""
     most = max(ratio, 1 / ratio)
-    if abs(most / round(most) - 1) > RATE_TOLERANCE:
-        return 0
-    return max(round(ratio), 1)
+    return 0 if abs(most / round(most) - 1) > RATE_TOLERANCE else max(round(ratio), 1)
 
 
 def uneven_steps(topic: str, rate: float, fps: int) -> str:

@@ -6,7 +6,7 @@ import logging
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from io import StringIO
 from itertools import count
 from pathlib import Path
@@ -34,7 +34,7 @@ from astra_data.pipeline.experiment import (
     to_make_again,
 )
 from astra_data.pipeline.plan import check_stage, plan, selected, stages_until
-from astra_data.pipeline.recipe import UserMethod, add_all, digests_of
+from astra_data.pipeline.recipe import UserMethod, add_all, check_unchanged, digests_of
 from astra_data.pipeline.shipped import is_shipped
 from astra_data.pipeline.stages.registry import STAGES
 from astra_data.reports.artifacts import CURVE, EVALUATION, METRICS, Artifact, Evaluation, read_json
@@ -241,7 +241,7 @@ def make(
                 done = f"{len(points.keys() & lines)} of {len(points)} points"
                 show(f"{key}  done {headline.text(lines[key][headline.measure])}  ({done})")
 
-        prepare = partial(_prepare, dict(recipe.user_methods))
+        prepare = partial(_prepare, recipe.task, dict(recipe.user_methods), folder)
         with display([item.key for item in items], console, finished) as watch:
             EXECUTORS[engine](items, jobs=jobs, logs=folder / "logs", watch=watch, prepare=prepare, address=address)
     made = {item.key for item in items}
@@ -250,11 +250,20 @@ def make(
         make(experiment, asked, planned, part, jobs=jobs, device=device, engine=engine, address=address)
 
 
-def _prepare(user_methods: dict[str, UserMethod]) -> None:
-    """Make a process ready for an item of a recipe with these methods of its own."""
+def _prepare(task: str, user_methods: dict[str, UserMethod], folder: Path) -> None:
+    """Make a process ready for an item of a recipe with this task and these methods, in a run's folder."""
     # One thread for the networks: they are small, and idle threads would slow down other items.
     torch.set_num_threads(1)
     add_all(user_methods)
+    _load(task, tuple((name, own.method) for name, own in user_methods.items()), folder)
+
+
+@cache
+def _load(task: str, methods: tuple[tuple[str, str], ...], folder: Path) -> None:
+    """Load the code of a run once in a process; refuse it if it was edited after the run had begun."""
+    task_named(task)
+    for name, place in (("task", task), *methods):
+        check_unchanged(place, folder, name=name)
 
 
 def _check_inputs(experiment: Experiment, items: Collection[Item], planned: Collection[Item]) -> None:
@@ -292,9 +301,8 @@ def _selected(items: tuple[Item, ...], stage: str, methods: Sequence[str]) -> li
         raise BadInputError(f"the recipe has no stage '{stage}'")
     made = {row_of_key(item.key) for item in selected}
     rows = [grounded_as(row) for row in methods] if stage in ("ground", "align") else methods
-    for row in rows:
-        if row not in made:
-            raise BadInputError(f"{row} has no stage '{stage}'")
+    if missing := [row for row in rows if row not in made]:
+        raise BadInputError(f"{missing[0]} has no stage '{stage}'")
     return [item for item in selected if not rows or row_of_key(item.key) in rows]
 
 

@@ -412,6 +412,4 @@ def _is_list(value: Any) -> bool:
 
 def _names_in(owner: Any) -> list[str] | None:
     names = _part(owner, _NAMES)
-    if not _is_list(names) or not all(isinstance(name, str) for name in names):
-        return None
-    return list(names)
+    return list(names) if _is_list(names) and all(isinstance(name, str) for name in names) else None
