@@ -9,7 +9,7 @@ with it, unless that is longer than `MOST_EXTRA_S`; then its frames are encoded 
 import io
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property, lru_cache
@@ -224,6 +224,22 @@ def clip_fault(clip: Clip) -> str | None:
     except CorruptDatasetError as error:
         return str(error)
     return None
+
+
+def altered_videos(clips: Iterable[Clip]) -> set[Path]:
+    """Return the videos of `clips` that are not as they were written."""
+    written = {clip.path: clip.digest for clip in clips if clip.digest and clip.path.is_file()}
+    return {path for path, digest in written.items() if file_digest(path) != digest}
+
+
+def encoded_again(clips: Mapping[int, Clip]) -> Iterator[tuple[int, Clip]]:
+    """Yield those of `clips` in altered videos of which every frame can be decoded, without digests."""
+    altered = altered_videos(clips.values())
+    for number, clip in clips.items():
+        anew = replace(clip, digest=None)
+        with suppress(CorruptDatasetError):
+            if clip.path in altered and sum(True for _ in _decode(anew)):
+                yield number, anew
 
 
 def images(clip: Clip) -> list[dict[str, Any]]:

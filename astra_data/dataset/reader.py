@@ -447,6 +447,6 @@ def explained(root: Path) -> Iterator[None]:
         yield
     except (CorruptDatasetError, KeyError) as error:
         fault = f"{error} is missing in its metadata" if isinstance(error, KeyError) else error
-        repair = f"`astra-data repair {root} --out FOLDER`."
+        repair = f"`astra-data repair {root} --out FOLDER`, with `--like ORIGINAL` if LeRobot's tools edited it."
         advice = f"Restore it from a copy, run the stage that wrote it again, or recover its intact episodes: {repair}"
         raise CorruptDatasetError(f"{root} is incomplete or was altered: {fault}. {advice}") from error

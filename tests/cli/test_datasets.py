@@ -30,9 +30,8 @@ def test_every_edit_is_the_next_version_at_home(fake: str, tmp_path: Path) -> No
     assert "(fake@data-1.2.0, 3 episodes, " in output_of("filter", fake, "--without", "13", "--without", "0")
     assert "(fake@data-1.3.0, 2 episodes, " in output_of("filter", fake, "--success")
     assert "(fake@data-1.4.0, 3 episodes, " in output_of("filter", fake, "--no-success")
-    assert "(fake@data-1.4.0, 5 episodes, 55 " in output_of(
-        "merge", "fake@data-1.3.0", "fake@data-1.4.0", "--out", str(tmp_path / "here")
-    )
+    merged = output_of("merge", "fake@data-1.3.0", "fake@data-1.4.0", "--out", str(tmp_path / "here"))
+    assert "(fake@data-1.4.0, 5 episodes, 55 " in merged
     assert open_dataset(tmp_path / "here").verify() == [] and len(versions_at_home("fake")) == 5
 
 
@@ -125,13 +124,12 @@ def test_a_damaged_dataset_hides_no_other(tmp_path: Path, monkeypatch: pytest.Mo
     assert result.output.count("@data-1.0.0") == 3
 
 
-@pytest.mark.parametrize("command", [["list"], ["inspect", "fake"]])
-def test_a_home_that_is_no_folder_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: list[str]) -> None:
+def test_a_home_that_is_no_folder_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "home").touch()
     monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path / "home"))
-    error = call(*command).exception
-    assert isinstance(error, AstraDataError)
-    assert re.search("home is no folder: expected|expected folders, got .*home", str(error))
+    for error in (call("list").exception, call("inspect", "fake").exception):
+        assert isinstance(error, AstraDataError)
+        assert re.search("home is no folder: expected|expected folders, got .*home", str(error))
 
 
 def test_no_name_controls_the_terminal(
@@ -180,6 +178,7 @@ def test_validate_and_repair(
     told = capsys.readouterr().err
     assert told.startswith(f"error: {root} has ") and "meta/tasks.parquet is missing" in told
     assert "meta/stats.json was altered" in told and told.endswith(f"astra-data repair {root} --out DIR\n")
+    assert f"LeRobot's tools edited it: astra-data repair {root} --like ORIGINAL --out DIR\n" in told
     assert called(monkeypatch, "repair", root, "--out", tmp_path / "saved") == 0
     assert "finished: " in capsys.readouterr().out
     assert called(monkeypatch, "repair", root, "--out", tmp_path / "saved") == 1
@@ -191,24 +190,20 @@ def test_lineage_and_differences_are_shown(tmp_path: Path) -> None:
     made = filter_episodes(first, without=[13], out=tmp_path / "made")
     assert output_of("log", str(made)).splitlines()[1].startswith("└── fake@data-1.0.0  ")
     told = output_of("log", str(first.root), str(made)).splitlines()
-    assert told[:3] == [
-        "fake@data-1.0.0: 5 episodes, 55 steps",
-        "fake@data-1.1.0: 4 episodes, 48 steps",
+    both, only = (
+        ["1.0.0: 5 episodes, 55 steps", "1.1.0: 4 episodes, 48 steps"],
         "1 episodes only in fake@data-1.0.0: 13",
-    ]
-    assert "stage: 'collect', then 'filter'" in told
-    back = output_of("log", str(made), str(first.root)).splitlines()
-    assert back[2] == "1 episodes only in fake@data-1.0.0: 13"
+    )
+    assert told[:3] == [*(f"fake@data-{one}" for one in both), only] and "stage: 'collect', then 'filter'" in told
+    assert output_of("log", str(made), str(first.root)).splitlines()[2] == only
 
 
 def test_values_are_told_from_metadata(tmp_path: Path) -> None:
     episodes = (replace(one, metadata={**one.metadata, "source": "log.csv"}) for one in fake_episodes())
     first, second = write_fake(tmp_path / "first"), write_fake(tmp_path / "second", episodes)
     told = output_of("log", str(first.root), str(second.root)).splitlines()
-    assert told[2:] == [
-        "0 episodes differ in values",
-        "5 episodes differ in metadata: source (0, 4, 6, 13, 9007199254740993)",
-    ]
+    metadata = "5 episodes differ in metadata: source (0, 4, 6, 13, 9007199254740993)"
+    assert told[2:] == ["0 episodes differ in values", metadata]
     other = write_fake(tmp_path / "other")
     assert output_of("log", str(first.root), str(other.root)).splitlines()[2:] == []
 
@@ -219,5 +214,4 @@ def test_cells_are_shown_as_they_are(capsys: pytest.CaptureFixture[str]) -> None
     for cell in cells:
         table.add_row(cell)
     show_table(table)
-    shown = capsys.readouterr().out
-    assert all(cell in shown for cell in cells)
+    assert all(cell in shown for shown in [capsys.readouterr().out] for cell in cells)

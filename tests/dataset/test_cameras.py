@@ -1,6 +1,5 @@
 import re
 import shutil
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,6 +9,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from damaged import edit
 from fake_dataset import COLUMNS, fake_episode, write_images, writer
 
 from astra_data.core.errors import BadInputError, CorruptDatasetError
@@ -18,6 +18,7 @@ from astra_data.dataset.columns import Clip
 from astra_data.dataset.doctor.check import check
 from astra_data.dataset.doctor.repair import repair
 from astra_data.dataset.edit import filter_episodes, merge, resample, subset, trim
+from astra_data.dataset.format import INFO_PATH
 from astra_data.dataset.frames import Frames
 from astra_data.dataset.inspection import inspect_dataset
 from astra_data.dataset.reader import Dataset
@@ -150,9 +151,8 @@ def test_frames_are_cut_within_groups_and_encoded_again_in_long_ones(codec: str,
     with av.open(str(path)) as file, av.open(str(clip.path)) as source:
         # lerobot's merge joins files with one time base.
         assert group == "250" or file.streams.video[0].time_base == source.streams.video[0].time_base
-        keys = [
-            float(one.pts * one.time_base) for one in file.demux(video=0) if one.pts is not None and one.is_keyframe
-        ]
+        begun = (one for one in file.demux(video=0) if one.pts is not None and one.is_keyframe)
+        keys = [float(one.pts * one.time_base) for one in begun]
     for found, before in zip(copies, (decoded(clip), decoded(clip)[5:25]), strict=True):
         if group == "12":
             np.testing.assert_array_equal(found, before)
@@ -169,14 +169,32 @@ def test_an_altered_video_is_refused_and_costs_its_episode_alone(source: Dataset
     video.write_bytes(content)
     assert check(root).faults == [f"{FRONT} in episode 0: {video} was altered after it was written"]
     assert Dataset.open(root).verify() == [f"{video} was altered after it was written"]
-    with pytest.raises(
-        CorruptDatasetError, match=r"was altered after it was written: `astra-data repair DATASET --out "
-    ):
+    with pytest.raises(CorruptDatasetError, match="altered after it was written: `astra-data repair DATASET --out "):
         subset(Dataset.open(root), percent=100, out=tmp_path / "all")
     assert not (tmp_path / "all").exists()
     notes = repair(root, out=tmp_path / "repaired").notes
     assert f"left out the episode of uid 3: {video} was altered after it was written" in notes
     assert_shows(tmp_path / "repaired", source, {uid: ALL[uid] for uid in (8, 5)})
+
+
+def test_videos_encoded_again_are_kept_where_the_original_is_named(source: Dataset, tmp_path: Path) -> None:
+    root = shutil.copytree(source.root, tmp_path / "edited")
+    edit(INFO_PATH, robot_type="cart")(root)
+    first, _, third = (film(video, 60) for video in sorted((root / "videos").rglob("*.mp4")))
+    with pytest.raises(CorruptDatasetError, match=r"info\.json was altered.* with `--like ORIGINAL` if LeRobot"):
+        Dataset.open(root)
+    alone = "\n".join(repair(root, out=tmp_path / "alone").notes)
+    assert f"if LeRobot's tools encoded {FRONT} again, --like" in alone and "fps may be wrong" not in alone
+    film(first, 5)  # too few frames
+    third.write_bytes((content := third.read_bytes())[:1000] + bytes(4000) + content[5000:])
+    notes = repair(root, like=source, out=tmp_path / "joined").notes
+    assert notes[0] == f"{FRONT} of 1 episodes was encoded again: its pictures are not those first written"
+    assert [uid for uid in LENGTHS if f"left out the episode of uid {uid}: {root}" in "".join(notes)] == [3, 5]
+    joined = Dataset.open(tmp_path / "joined")
+    assert check(joined.root).faults == [] and joined.uids.tolist() == [8]
+    assert joined.pictures(FRONT, 0).shape == (9, 64, 64, 3)
+    np.testing.assert_array_equal(joined.pictures(TOP, 0), source.pictures(TOP, 1))
+    assert joined.description["parents"] == [source.identity]
 
 
 def test_without_its_videos_a_camera_is_left_out_and_the_rest_recovered(source: Dataset, tmp_path: Path) -> None:
@@ -275,11 +293,8 @@ def test_pictures_load_as_frames(source: Dataset) -> None:
 
 def test_what_does_not_fit_is_refused(source: Dataset, tmp_path: Path) -> None:
     clips = next(source.episodes()).cameras
-    cases: Sequence[tuple[dict[str, Clip], str]] = [
-        ({FRONT: clips[FRONT]}, TOP),
-        ({**clips, FRONT: clips[FRONT].part(0, 5)}, "5 pictures for 14 steps"),
-    ]
-    for given, expected in cases:
+    few = {**clips, FRONT: clips[FRONT].part(0, 5)}
+    for given, expected in (({FRONT: clips[FRONT]}, TOP), (few, "5 pictures for 14 steps")):
         with pytest.raises(BadInputError, match=expected), writer(tmp_path / "out", cameras=FEATURES) as opened:
             opened.add(replace(fake_episode(3, 14), cameras=given))
     with pytest.raises(BadInputError, match="divides 20, got 3"):

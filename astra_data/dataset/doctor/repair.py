@@ -14,7 +14,7 @@ from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.dataset import columns as names
 from astra_data.dataset import format as layout
 from astra_data.dataset import lerobot_recording as lerobot
-from astra_data.dataset.cameras import Camera, clip_fault, clips_of_runs, read_cameras
+from astra_data.dataset.cameras import Camera, altered_videos, clip_fault, clips_of_runs, encoded_again, read_cameras
 from astra_data.dataset.columns import Array, Column, Episode, Scalar, distinct_uids, renamed_metadata
 from astra_data.dataset.description import Digests, altered_files, read_description, read_digests
 from astra_data.dataset.doctor.salvage import whole_runs
@@ -55,6 +55,7 @@ def repair(
     taken from them, joined by episode_uid and values, the provenance from the first. An episode with the uid of one of
     theirs and other values is left out, or, with `new_uids`, has no metadata. With these, an episode whose uid an
     earlier one has gets a new one, the same in every run, and the old one as "merged_uid"; otherwise it is left out.
+    Videos that were encoded again are kept.
     """
     if not folder.is_dir():
         raise BadInputError(f"{folder}: expected the folder of a dataset, got no folder")
@@ -81,6 +82,10 @@ def repair(
     if old:
         made_from = [other.identity for other in sources[1:]]
         description = successor(old, "episodes", stage="repair", config=config, out=folder, parents=made_from)[0]
+    for name, camera in remains.cameras.items() if sources else ():  # LeRobot's tools encode videos again in place
+        if again := dict(encoded_again(camera.clips)):
+            remains.cameras |= {name: camera._replace(clips={**camera.clips, **again})}
+            notes.append(f"{name} of {len(again)} episodes was encoded again: its pictures are not those first written")
     cameras = _seen(folder, remains, whole, notes)
     features = {name: camera.feature for name, camera in cameras.items()}
     known_facts: dict[str, Any] = {"task": task, "description": description, "subset_seed": remains.subset_seed}
@@ -142,7 +147,7 @@ class Remains:
     specs: Sequence[Column]  # those of the new dataset
     fps: int
     tasks: Mapping[int, str]
-    cameras: Mapping[str, Camera]
+    cameras: dict[str, Camera]
     rows: lerobot.Rows | None  # how its rows become ours, where LeRobot recorded it without next states; else None
     subset_seed: int
     old: Mapping[str, Any] = field(default_factory=dict)  # its own description
@@ -241,7 +246,11 @@ def remains_of(folder: Path, sources: Sequence[Dataset], notes: list[str]) -> Re
             notes.append(f"{error}: the origin is unknown")
     # A missing file is told where it is read.
     altered = [path for path in altered_files(folder, remains.old) if (folder / path).exists()]
-    notes += [f"{path} was altered after it was written: {why}" for path, why in _IF_ALTERED.items() if path in altered]
+    follows = dict(_IF_ALTERED)
+    for name, (_, clips, _) in cameras.items() if layout.INFO_PATH in altered else ():
+        if clips and {clip.path for clip in clips.values()} == altered_videos(clips.values()):
+            follows[layout.INFO_PATH] = f"if LeRobot's tools encoded {name} again, --like ORIGINAL keeps it"
+    notes += [f"{path} was altered after it was written: {why}" for path, why in follows.items() if path in altered]
     try:
         remains.digests = read_digests(folder, [column.name for column in columns], altered)
     except CorruptDatasetError as error:

@@ -175,9 +175,8 @@ def test_format_2_is_converted_with_tasks_and_names(tmp_path: Path, lost: int | 
     whole = [states[number][:-1] for number in range(4) if number != lost]
     assert [episode.columns[STATE].tolist() for episode in found.episodes()] == whole
     assert notes[0] == "LeRobot's format v2.1 became v3.0"
-    assert [note for note in notes if note.endswith("is missing")] == (
-        [] if lost is None else [f"{names[lost]} is missing"]
-    )
+    gone = [] if lost is None else [f"{names[lost]} is missing"]
+    assert [note for note in notes if note.endswith("is missing")] == gone
 
 
 def test_tasks_are_known_by_their_index(killed: Path, tmp_path: Path) -> None:
@@ -271,9 +270,8 @@ def test_episodes_with_other_values_than_were_written_are_left_out(whole: Datase
     repaired = repair(whole.root, out=tmp_path / "saved")
     [second, third, lost] = repaired.notes
     assert "left out episode 2: frame_index is 7" in second
-    assert third == (
-        f"left out episode 3: next.reward: other values than were written in {DATA} rows 20 to 49 (episode 3)"
-    )
+    other = "other values than were written in"
+    assert third == f"left out episode 3: next.reward: {other} {DATA} rows 20 to 49 (episode 3)"
     assert lost == "2 of the 5 episodes that meta/info.json counts are lost"
     saved = Dataset.open(tmp_path / "saved")
     assert saved.description["repaired"] == repaired.notes
@@ -353,7 +351,7 @@ def test_the_same_episode_again_has_another_uid_the_same_in_every_run(fake: Data
 
 INFO, TASKS = INFO_PATH, "meta/tasks.parquet"
 SEED_0 = "the order of the subsets is that of seed 0"
-WAS = "was altered after it was written"
+WAS, COMPARED = "was altered after it was written", "the values were compared with the content hash only, as a whole"
 LOST = "success, return and the like of the episodes are lost"
 
 
@@ -373,11 +371,7 @@ def seen(root: Path, *sources: Dataset) -> tuple[Remains, list[str]]:
         (drop(TASKS), f"{TASKS} is missing: the task is unknown", "tasks"),
         (alter(TASKS, "task", 0, "sit"), f"{TASKS} {WAS}: the task may be wrong", ""),
         (edit(INFO, fps=10), f"{INFO} {WAS}: names, units and fps may be wrong", ""),
-        (
-            drop(DIGESTS_PATH),
-            f"{DIGESTS_PATH} is missing: the values were compared with the content hash only, as a whole",
-            "digests",
-        ),
+        (drop(DIGESTS_PATH), f"{DIGESTS_PATH} is missing: {COMPARED}", "digests"),
     ],
 )
 def test_what_is_missing_or_altered_is_noted(
