@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from astra_data.core.arrays import as_column
-from astra_data.core.errors import BadInputError, unmet
+from astra_data.core.errors import BadInputError, in_short, unmet
 
 STATE = "observation.state"  # (T, S) float32: the full target state s_t
 GOAL = "observation.environment_state"  # (T, G) float32: the goal, if any; LeRobot's own policies need it to train
@@ -216,18 +216,24 @@ class Episode:
         """Convert numpy scalars and array layouts, and validate the episode."""
         metadata = {k: v.item() if isinstance(v, np.generic) else v for k, v in self.metadata.items()}
         masked = [k for k, v in self.columns.items() if isinstance(v, np.ma.MaskedArray) and v.mask.any()]
-        columns = {name: as_column(np.asarray(values, order="C")) for name, values in self.columns.items()}
+        columns, faults = dict[str, Array](), list[str]()
+        for name, values in self.columns.items():
+            try:
+                columns[name] = as_column(np.asarray(values, order="C"))
+            except (RuntimeError, TypeError, ValueError) as error:  # tensors with gradients or bfloat16, uneven lists
+                wanted = "expected an array, or tensor.detach().cpu().float() of a tensor"
+                faults.append(f"{name}: {in_short(error)}; {wanted}")
         object.__setattr__(self, "metadata", metadata)
         object.__setattr__(self, "columns", columns)
         is_uid = type(self.uid) is int and 0 <= self.uid < 2**63
-        faults = [] if is_uid else [f"uid {self.uid!r}, expected an int in [0, 2^63)"]
+        faults += [] if is_uid else [f"uid {self.uid!r}, expected an int in [0, 2^63)"]
         faults += [f"{name}: masked values, expected a value for every step" for name in masked]
         faults += [fault for name, values in columns.items() for fault in _column_faults(name, values)]
         lengths = {name: len(values) for name, values in columns.items() if values.ndim}
         if len(set(lengths.values())) > 1:
             listed = ", ".join(f"{name} {length}" for name, length in lengths.items())
             faults.append(f"columns differ in their number of steps ({listed})")
-        elif not columns or 0 in lengths.values():
+        elif not self.columns or 0 in lengths.values():
             faults.append("there are no steps" if columns else "there are no columns")
         faults += [fault for key, value in metadata.items() for fault in _metadata_faults(key, value)]
         if faults:

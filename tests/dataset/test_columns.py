@@ -2,6 +2,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from fake_dataset import COLUMNS, fake_columns
 
 from astra_data.core.errors import BadInputError
@@ -44,12 +45,14 @@ def test_an_episode_makes_its_columns_contiguous_and_its_metadata_plain() -> Non
 
 
 def test_every_fault_of_an_episode_is_reported_at_once() -> None:
-    columns = fake_columns(6, seed=1)
+    columns: dict[str, Any] = dict(fake_columns(6, seed=1))
     columns[keys.STATE][4, 1] = np.nan
     columns[keys.STATE][5, 0] = np.inf
     columns[keys.ACTION] = columns[keys.ACTION].astype(np.float64)
     columns[keys.REWARD] = columns[keys.REWARD][:5, None, None]
     columns["episode_uid"] = np.zeros(6, np.int64)
+    columns["force"], columns["torque"] = torch.ones(6, requires_grad=True), torch.ones(6, dtype=torch.bfloat16)
+    columns["uneven"] = [[1.0], [1.0, 2.0]]
     with pytest.raises(BadInputError) as caught:
         keys.Episode(-1, columns, {"return": float("nan"), "seeds": [1]})  # type: ignore[dict-item]
     message = str(caught.value)
@@ -61,6 +64,9 @@ def test_every_fault_of_an_episode_is_reported_at_once() -> None:
         "next.reward: shape (5, 1, 1), expected (T,) or (T, size)",
         "next.reward 5",
         "episode_uid: is filled in by the writer",
+        "force: Can't call numpy() on Tensor that requires grad; expected an array, or tensor.detach().cpu().float()",
+        "torque: Got unsupported ScalarType BFloat16; expected an array, or tensor.detach()",
+        "uneven: setting an array element with a sequence; expected an array",
         "metadata return: nan",
         "metadata seeds: list",
     ):
@@ -76,47 +82,34 @@ def test_one_value_per_step_may_be_given_as_gymnasium_has_it() -> None:
             keys.Episode(0, {keys.REWARD: empty})
 
 
-@pytest.mark.parametrize(
-    ("columns", "part"),
-    [
-        ({}, "no columns"),
-        ({keys.STATE: np.zeros((0, 2), np.float32)}, "no steps"),
-        ({keys.STATE: np.float32(1)}, r"shape \(\)"),
-    ],
-)
-def test_an_empty_episode_is_refused(columns: dict[str, keys.Array], part: str) -> None:
-    with pytest.raises(BadInputError, match=part):
-        keys.Episode(0, columns)
+def test_an_empty_episode_is_refused() -> None:
+    state: dict[str, Any] = {"no steps": np.zeros((0, 2), np.float32), r"shape \(\)": np.float32(1)}
+    for part, columns in {"no columns": {}, **{part: {keys.STATE: one} for part, one in state.items()}}.items():
+        with pytest.raises(BadInputError, match=part):
+            keys.Episode(0, columns)
 
 
-@pytest.mark.parametrize(
-    ("astra", "fault"),
-    [
+def test_roles_must_make_sense() -> None:
+    for astra, fault in (
         ({"role": ["position", "vector", "vector"]}, "role position at index 0, expected 2 indices"),
         ({"role": ["heading", "heading", "position"]}, "role position at index 2, expected 2 indices"),
         ({"mirror": ["a", "b", "c"]}, "astra has 'mirror', expected unit, frame, role"),
-    ],
-)
-def test_roles_must_make_sense(astra: dict[str, list[str]], fault: str) -> None:
-    with pytest.raises(BadInputError, match=fault):
-        keys.Column("pose", size=3, names=("a", "b", "c"), astra=astra)
+    ):
+        with pytest.raises(BadInputError, match=fault):
+            keys.Column("pose", size=3, names=("a", "b", "c"), astra=astra)
 
 
-@pytest.mark.parametrize(
-    "change", [{"astra": {"unit": 5}}, {"names": 3}, {"shape": []}, {"astra": "m"}, {"shape": "x"}]
-)
-def test_a_damaged_entry_of_features_is_bad_input(change: dict[str, object]) -> None:
-    with pytest.raises(BadInputError, match="Column 'x'"):
-        keys.Column.from_feature("x", {"dtype": "float32", "shape": [1], "names": None} | change)
-
-
-def _episodes(*lengths: int) -> list[keys.Episode]:
-    return [keys.Episode(uid, {"action": np.zeros(length, np.float32)}) for uid, length in enumerate(lengths)]
+def test_a_damaged_entry_of_features_is_bad_input() -> None:
+    damage: list[dict[str, Any]] = [{"astra": {"unit": 5}}, {"astra": "m"}, {"names": 3}, {"shape": []}, {"shape": "x"}]
+    for change in damage:
+        with pytest.raises(BadInputError, match="Column 'x'"):
+            keys.Column.from_feature("x", {"dtype": "float32", "shape": [1], "names": None} | change)
 
 
 def test_a_block_ends_with_the_episode_that_fills_it() -> None:
     """None is left out or split, and the last is there though it isn't full."""
-    blocks = keys.in_blocks(_episodes(3, 2, 9, 1, 4, 1), rows=5)
+    columns = [{"action": np.zeros(length, np.float32)} for length in (3, 2, 9, 1, 4, 1)]
+    blocks = keys.in_blocks((keys.Episode(uid, one) for uid, one in enumerate(columns)), rows=5)
     assert [[episode.uid for episode in block] for block in blocks] == [[0, 1], [2], [3, 4], [5]]
 
 
