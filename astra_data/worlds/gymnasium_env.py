@@ -10,7 +10,7 @@ from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError
 from astra_data.core.lazy import gymnasium
 from astra_data.worlds.commands import Commands
-from astra_data.worlds.simulators import NumpySimulator
+from astra_data.worlds.simulators import NumpySimulator, shaped
 from astra_data.worlds.task import State
 from astra_data.worlds.user_code import answered, explained
 
@@ -140,6 +140,9 @@ class GymnasiumSimulator(NumpySimulator):
         inner, is_checked = env.unwrapped, False
         env.reset(seed=0)
 
+        def shown(inner: Env) -> Floats:
+            return shaped(f"{env_id}: read(env)", read(inner), (size,), f"return {size} values, or give another size")
+
         def step_each(states: Floats, commands: Floats) -> Floats:
             nonlocal is_checked
             if env.action_space.shape != commands.shape[1:]:
@@ -149,15 +152,14 @@ class GymnasiumSimulator(NumpySimulator):
             for row, (state, command) in enumerate(zip(states, commands, strict=True)):
                 write(inner, state)
                 env.step(command)
-                landed[row] = read(inner)
+                landed[row] = shown(inner)
                 if not is_checked:
                     env.reset(seed=0)
-                    write(inner, landed[row])
-                    written, shown = landed[row], np.asarray(read(inner))
-                    if shown.shape != written.shape or not np.allclose(shown, written, **_SAME):
+                    write(inner, written := landed[row])
+                    if not np.allclose(found := shown(inner), written, **_SAME):
                         raise BadInputError(
                             f"{env_id}: after write(env, {written.tolist()}) expected the same of read(env), "
-                            f"got {shown.tolist()}: write has to set what read returns"
+                            f"got {found.tolist()}: write has to set what read returns"
                         )
                     is_checked = True
             return landed

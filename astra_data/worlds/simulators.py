@@ -15,6 +15,17 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.lazy import Tensor, mujoco, torch
 from astra_data.core.provenance import cores
 from astra_data.worlds.plane.mazes import Maze
+from astra_data.worlds.user_code import explained
+
+
+def shaped(what: str, found: object, shape: tuple[int, ...], advice: str) -> Floats:
+    """Return what the user's code `found` as an array; refuse what is none of `shape`."""
+    with explained(what):
+        array = np.asarray(found, dtype=np.float64)
+    if array.shape != shape:
+        got = "None" if found is None else array.shape
+        raise BadInputError(f"{what}: expected an array of shape {shape}, got {got}: {advice}")
+    return array
 
 
 class FreeStates:
@@ -54,7 +65,9 @@ class NumpySimulator(FreeStates):
     def step(self, action: Tensor) -> Tensor:
         """Apply commands `action` (B, A); return the new states (B, X)."""
         landed = self._function(self.state.double().numpy(), action.double().numpy())
-        self.state = torch.from_numpy(np.array(landed, dtype=np.float32))
+        expected, advice = tuple(self.state.shape), "return the next state of every row"
+        landed = shaped("the simulator's function of states and commands", landed, expected, advice)
+        self.state = torch.from_numpy(landed.astype(np.float32))
         return self.state
 
 

@@ -177,26 +177,24 @@ def test_every_state_is_stepped_as_by_an_environment_of_its_own() -> None:
 def test_what_is_written_has_to_be_what_is_read() -> None:
     """Entries in another order, say; after the first step nothing is read twice."""
 
-    def swapped(env: Env, state: State) -> None:
-        write(env, state[::-1])
-
-    def nothing(env: Env, state: State) -> None:
-        pass
-
-    for wrong in (swapped, nothing):
-        simulator = GymnasiumSimulator(2, env_id="Pendulum-v1", size=2, read=read, write=wrong)
+    for wrong in (lambda env, state: write(env, state[::-1]), lambda env, state: None):
+        simulator = make(2, env_id="Pendulum-v1", write=wrong)
         simulator.reset_to(torch.tensor([[0.5, 0.5], [1.0, 0.25]]))
         with pytest.raises(BadInputError, match=r"^Pendulum-v1: after write\(.* expected the same"):
             simulator.step(torch.zeros(2, 1))
     with pytest.raises(BadInputError, match=r"^Pendulum-v1: expected as many commands as actions, Box\(.*: got 2"):
         make(2, env_id="Pendulum-v1").step(torch.zeros(2, 2))
+    with pytest.raises(
+        BadInputError, match=r"^Pendulum-v1: read\(env\): .* \(2,\), got \(3,\): return 2 values, or give"
+    ):
+        make(2, env_id="Pendulum-v1", read=lambda env: [*read(env), 0.0]).step(torch.zeros(2, 1))
     reads = []
 
     def noted(env: Env) -> State:
         reads.append(0)
         return read(env)
 
-    simulator = GymnasiumSimulator(2, env_id="Pendulum-v1", size=2, read=noted, write=write)
+    simulator = make(2, env_id="Pendulum-v1", read=noted)
     for expected in (3, 5):
         simulator.step(torch.zeros(2, 1))
         assert len(reads) == expected

@@ -33,6 +33,14 @@ def test_equals_the_function_by_hand() -> None:
     np.testing.assert_allclose(landed.numpy(), np.column_stack([z.real, z.imag]), atol=1e-6)
 
 
+def test_a_function_that_returns_no_state_of_every_row_is_refused() -> None:
+    for wrong, got in ((lambda state, command: None, "None"), (lambda state, command: state[1:], r"\(2, 2\)")):
+        with pytest.raises(
+            BadInputError, match=rf"function of .* expected .* \(3, 2\), got {got}: return the next state"
+        ):
+            NumpySimulator(3, function=wrong, size=2).step(torch.zeros(3, 1))  # type: ignore[arg-type]
+
+
 PENDULUM = """
 <mujoco>
   <option timestep="0.01"/>
