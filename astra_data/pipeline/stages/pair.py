@@ -22,6 +22,11 @@ from astra_data.worlds.user_code import expect_tensor, explained, stepped
 
 BATCH = 4096  # simulators that are reset and stepped in one batch
 _BLOCK = 8 * BATCH  # steps held in memory at once, rounded up to whole episodes
+_MEANINGS = {
+    keys.ABSTRACT_STATE: "abstract state of the target before the action",
+    keys.ABSTRACT_NEXT_STATE: "abstract state of the target after the action",
+    keys.ABSTRACT_SIMULATED_NEXT_STATE: "where the abstract simulator lands, reset to abstract.state",
+}
 _log = logging.getLogger(__name__)
 
 
@@ -43,6 +48,7 @@ def pair(
 ) -> Path:
     """Add the columns `abstract.*` to `dataset`, vectorized over its steps; return the new folder.
 
+    Those that are left where another tool removed one of them are made anew.
     `simulator` is a task, for its abstract simulator, or `path.py:MySimulator`.
 
     Raises:
@@ -62,17 +68,13 @@ def pair(
     stopwatch = Stopwatch()
     batch = built(pairing, BATCH)
     bounds = {} if pairing.commands is None else {"commands": {k: list(v) for k, v in pairing.commands.items()}}
-    meanings = {
-        keys.ABSTRACT_STATE: "abstract state of the target before the action",
-        keys.ABSTRACT_NEXT_STATE: "abstract state of the target after the action",
-        keys.ABSTRACT_SIMULATED_NEXT_STATE: "where the abstract simulator lands, reset to abstract.state",
-    }
-    added = [replace(pairing.abstract_state, name=name, meaning=text) for name, text in meanings.items()]
+    added = [replace(pairing.abstract_state, name=name, meaning=text) for name, text in _MEANINGS.items()]
+    stays = [column for column in source.schema if column.name not in _MEANINGS]
     steps, reset_error, farthest = 0, 0.0, np.zeros(added[0].size)
     jumps = {unit: np.zeros(added[0].size, np.int64) for unit in TURNS}
     made, settings = {"id": pairing.id, **pairing.origin, **batch.parameters, **bounds}, config.model_dump(mode="json")
     with next_version(
-        source, "columns", stage="pair", config=settings, name=name, out=out, more=added, simulator=made
+        source, "columns", stage="pair", config=settings, name=name, out=out, schema=stays, more=added, simulator=made
     ) as writer:
         for episodes in in_blocks(source.episodes(), _BLOCK):
             read, tolerance = (keys.STATE, keys.ACTION, keys.NEXT_STATE), config.reset_tolerance
@@ -163,7 +165,7 @@ def _check(source: Dataset, pairing: Pairing) -> None:
         fault = f"was collected for {task}, which has another maze than {pairing.origin['task']}"
         raise BadInputError(f"{source.reference} {fault}: give --simulator {task}")
     faults = [f"no column {name}" for name in (keys.STATE, keys.ACTION, keys.NEXT_STATE) if name not in source.features]
-    if keys.ABSTRACT_STATE in source.features:
+    if _MEANINGS.keys() <= source.features.keys():
         faults.append(f"{keys.ABSTRACT_STATE} already: it is paired")
     if pairing.fps not in (None, source.info["fps"]):
         faults.append(f"{source.info['fps']} steps per second, where {pairing.id} makes {pairing.fps}")

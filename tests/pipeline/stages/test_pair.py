@@ -9,16 +9,7 @@ from fake_dataset import write_fake
 from toy_logs import write_logs
 
 from astra_data.core.errors import BadInputError
-from astra_data.dataset.columns import (
-    ABSTRACT_NEXT_STATE,
-    ABSTRACT_SIMULATED_NEXT_STATE,
-    ABSTRACT_STATE,
-    ACTION,
-    NEXT_STATE,
-    STATE,
-    Column,
-    Episode,
-)
+from astra_data.dataset import columns as keys
 from astra_data.dataset.reader import Dataset
 from astra_data.pipeline.stages.pair import PairConfig, pair, pair_steps
 from astra_data.robots.registry import TASKS, pairing_named
@@ -26,32 +17,27 @@ from astra_data.robots.registry import TASKS, pairing_named
 _PLANAR = [0, 1, 15, 16]
 """x, y, vx and vy in an ant's qpos (15) and qvel (14)."""
 MINE = Path(__file__).parents[2] / "my_simulator.py"
+PAIR = (keys.ABSTRACT_STATE, keys.ABSTRACT_NEXT_STATE, keys.ABSTRACT_SIMULATED_NEXT_STATE)
 
 
 def test_the_simulator_starts_where_the_target_was_and_takes_its_action(paired: Path) -> None:
-    names = (STATE, ACTION, NEXT_STATE, ABSTRACT_STATE, ABSTRACT_NEXT_STATE, ABSTRACT_SIMULATED_NEXT_STATE)
-    columns = Dataset.open(paired).columns(names)
-    np.testing.assert_array_equal(columns[ABSTRACT_STATE], columns[STATE][:, _PLANAR])
-    np.testing.assert_array_equal(columns[ABSTRACT_NEXT_STATE], columns[NEXT_STATE][:, _PLANAR])
-    position = columns[STATE][:, :2].astype(np.float64)
-    landed = columns[ABSTRACT_SIMULATED_NEXT_STATE]
+    columns = Dataset.open(paired).columns([keys.STATE, keys.ACTION, keys.NEXT_STATE, *PAIR])
+    np.testing.assert_array_equal(columns[keys.ABSTRACT_STATE], columns[keys.STATE][:, _PLANAR])
+    np.testing.assert_array_equal(columns[keys.ABSTRACT_NEXT_STATE], columns[keys.NEXT_STATE][:, _PLANAR])
+    position = columns[keys.STATE][:, :2].astype(np.float64)
+    landed = columns[keys.ABSTRACT_SIMULATED_NEXT_STATE]
     free = TASKS["antmaze-umaze"].maze.clearance(position) > 0.4
     assert free.sum() > 100
-    np.testing.assert_allclose(landed[free, :2], (position + 0.05 * columns[ACTION])[free], atol=1e-5)
-    np.testing.assert_allclose(landed[free, 2:], columns[ACTION][free], atol=1e-4)
+    np.testing.assert_allclose(landed[free, :2], (position + 0.05 * columns[keys.ACTION])[free], atol=1e-5)
+    np.testing.assert_allclose(landed[free, 2:], columns[keys.ACTION][free], atol=1e-4)
 
 
 def test_all_else_stays_and_the_parent_is_recorded(collected: Path, paired: Path) -> None:
     before, after = Dataset.open(collected), Dataset.open(paired)
     assert after.description["parents"] == [before.identity]
     assert after.reference == before.reference.replace("1.0.0", "2.0.0") and after.description["reset_error"] == 0.0
-    assert after.description["simulator"] == {
-        "id": "point_mass",
-        "task": "antmaze-short",
-        "timestep_s": 0.05,
-        "radius_m": 0.1,
-        "speed_m_s": 1.0,
-    }
+    numbers = {"timestep_s": 0.05, "radius_m": 0.1, "speed_m_s": 1.0}
+    assert after.description["simulator"] == {"id": "point_mass", "task": "antmaze-short", **numbers}
     assert after.description["machine"] == before.description["machine"] and after.order == before.order
     assert after.metadata == before.metadata
     for one, other in zip(before.episodes(), after.episodes(), strict=True):
@@ -63,17 +49,17 @@ def test_all_else_stays_and_the_parent_is_recorded(collected: Path, paired: Path
 def test_abstract_columns_have_units_frames_and_roles(paired: Path) -> None:
     features = Dataset.open(paired).features
     meanings = set()
-    for name in (ABSTRACT_STATE, ABSTRACT_NEXT_STATE, ABSTRACT_SIMULATED_NEXT_STATE):
+    for name in PAIR:
         astra = features[name]["astra"]
         meanings.add(astra["meaning"])
         assert features[name]["names"] == ["x", "y", "vx", "vy"]
         for key in ("unit", "frame", "role"):  # as in the target's columns
-            assert astra[key] == [features[STATE]["astra"][key][index] for index in _PLANAR]
+            assert astra[key] == [features[keys.STATE]["astra"][key][index] for index in _PLANAR]
     assert len(meanings) == 3
 
 
 def test_many_simulators_give_what_one_gives(collected: Path) -> None:
-    columns = Dataset.open(collected).columns([STATE, ACTION, NEXT_STATE])
+    columns = Dataset.open(collected).columns([keys.STATE, keys.ACTION, keys.NEXT_STATE])
     steps = [values[:25] for values in columns.values()]
     pairing = pairing_named("antmaze-umaze")
     wide, _ = pair_steps(pairing, pairing.simulator(64), *steps, tolerance=0.0)
@@ -89,37 +75,23 @@ def test_a_simulator_of_your_own(collected: Path, tmp_path: Path) -> None:
     dataset = Dataset.open(tmp_path / "out")
     digest = hashlib.sha256(MINE.read_bytes()).hexdigest()
     assert dataset.description["simulator"] == {"id": "Glider", "file_sha256": digest, "timestep_s": 0.05}
-    assert dataset.features[ABSTRACT_STATE]["names"] == ["x", "y"]
-    columns = dataset.columns([STATE, ACTION, ABSTRACT_SIMULATED_NEXT_STATE])
-    expected = columns[STATE][:, :2] + np.float32(0.05) * columns[ACTION]
-    np.testing.assert_array_equal(columns[ABSTRACT_SIMULATED_NEXT_STATE], expected)
+    assert dataset.features[keys.ABSTRACT_STATE]["names"] == ["x", "y"]
+    columns = dataset.columns([keys.STATE, keys.ACTION, keys.ABSTRACT_SIMULATED_NEXT_STATE])
+    expected = columns[keys.STATE][:, :2] + np.float32(0.05) * columns[keys.ACTION]
+    np.testing.assert_array_equal(columns[keys.ABSTRACT_SIMULATED_NEXT_STATE], expected)
+
+
+def glider(place: Path, name: str, *body: str) -> str:
+    """Write a simulator that is Glider but for the lines of `body`."""
+    first = f"import sys\nsys.path.insert(0, {str(MINE.parent)!r})\nfrom my_simulator import Glider"
+    (place / f"{name}.py").write_text("\n    ".join([f"{first}\nclass {name}(Glider):", *body]))
+    return f"{place}/{name}.py:{name}"
 
 
 def glider_that_is_off(place: Path, error: float, later: str) -> str:
     """Write a simulator that is reset with an error, and at each time after with that which `later` gives."""
-    (place / "off.py").write_text(
-        f"import sys\nsys.path.insert(0, {str(MINE.parent)!r})\nfrom my_simulator import Glider\n"
-        "class Off(Glider):\n"
-        f"    error = {error}\n"
-        "    def reset_to(self, state, rows=None):\n"
-        "        super().reset_to(state + self.error, rows)\n"
-        f"        self.error = {later}\n"
-    )
-    return f"{place}/off.py:Off"
-
-
-def glider_that_gets_lost(place: Path) -> str:
-    """Write a simulator whose second step has no y in its fourth row."""
-    (place / "lost.py").write_text(
-        f"import sys\nsys.path.insert(0, {str(MINE.parent)!r})\nfrom my_simulator import Glider\n"
-        "class Lost(Glider):\n"
-        "    steps = 0\n"
-        "    def step(self, action):\n"
-        "        self.steps += 1\n"
-        "        super().step(action)[3, 1] /= float(self.steps < 2)\n"
-        "        return self.state\n"
-    )
-    return f"{place}/lost.py:Lost"
+    reset = f"super().reset_to(state + self.error, rows); self.error = {later}"
+    return glider(place, "Off", f"error = {error}", f"def reset_to(self, state, rows=None): {reset}")
 
 
 @pytest.mark.parametrize("size", ["_BLOCK", "BATCH"])
@@ -167,11 +139,10 @@ def test_data_of_another_rate_are_refused(collected: Path, tmp_path: Path) -> No
     told = r"slow has 10 steps per second, where point_mass makes 20; expected a dataset to be paired"
     with pytest.raises(BadInputError, match=told):
         pair("antmaze-umaze", dataset=slow, out=tmp_path / "out")
-    simulator = f"{MINE}:Glider"  # of no task, and of no rate
-    pair(simulator, dataset=slow, out=tmp_path / "out")
+    pair(f"{MINE}:Glider", dataset=slow, out=tmp_path / "out")  # of no task, and of no rate
 
 
-def rewritten(source: Dataset, out: Path, changed: dict[str, Column]) -> Path:
+def rewritten(source: Dataset, out: Path, changed: dict[str, keys.Column]) -> Path:
     """Write the first episode of a dataset with some columns called, and cut, as `changed` has them."""
     columns = [changed.get(column.name, column) for column in source.schema]
     description = {"name": "other", "stage": "import", "environment": source.description["environment"]}
@@ -183,9 +154,9 @@ def rewritten(source: Dataset, out: Path, changed: dict[str, Column]) -> Path:
 
 def test_bounds_of_the_commands_are_recorded(tmp_path: Path) -> None:
     """They say what the commands are multiples of to whoever learns from the pairs."""
-    columns = [Column(STATE, size=2), Column(NEXT_STATE, size=2), Column(ACTION, size=1)]
+    columns = [keys.Column(keys.STATE, size=2), keys.Column(keys.NEXT_STATE, size=2), keys.Column(keys.ACTION, size=1)]
     still = np.zeros((3, 2), np.float32)
-    episode = Episode(0, {STATE: still, NEXT_STATE: still, ACTION: still[:, 0]}, {})
+    episode = keys.Episode(0, {keys.STATE: still, keys.NEXT_STATE: still, keys.ACTION: still[:, 0]}, {})
     write_fake(tmp_path / "logs", [episode], columns=columns, fps=10)
     cart = f"{MINE.with_name('small_cart.py')}:TASK"
     out = pair(cart, dataset=tmp_path / "logs", out=tmp_path / "out")
@@ -196,15 +167,15 @@ def test_bounds_of_the_commands_are_recorded(tmp_path: Path) -> None:
 def test_names_that_are_not_the_tasks_are_told(
     collected: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    action = next(column for column in Dataset.open(collected).schema if column.name == ACTION)
+    action = next(column for column in Dataset.open(collected).schema if column.name == keys.ACTION)
     other = replace(action, names=("left", "right"))
-    source = rewritten(Dataset.open(collected), tmp_path / "other", {ACTION: other})
+    source = rewritten(Dataset.open(collected), tmp_path / "other", {keys.ACTION: other})
     pair("antmaze-umaze", dataset=source, out=tmp_path / "out")
     assert "takes left, right of action as " in caplog.text
 
 
 def test_data_of_another_robot_are_refused(collected: Path, tmp_path: Path) -> None:
-    changed = {name: Column(name, size=2) for name in (STATE, NEXT_STATE)}
+    changed = {name: keys.Column(name, size=2) for name in (keys.STATE, keys.NEXT_STATE)}
     other = rewritten(Dataset.open(collected), tmp_path / "other", changed)
     with pytest.raises(BadInputError, match=r"observation.state has 2 values, expected those of antmaze-umaze: "):
         pair("antmaze-umaze", dataset=other, out=tmp_path / "out")
@@ -214,6 +185,19 @@ def test_data_of_another_robot_are_refused(collected: Path, tmp_path: Path) -> N
 def test_a_paired_dataset_is_not_paired_again(paired: Path, tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match=r"has abstract.state already: it is paired"):
         pair("antmaze-umaze", dataset=paired, out=tmp_path / "out")
+
+
+@pytest.mark.usefixtures("task")
+@pytest.mark.parametrize("removed", PAIR)
+def test_of_which_a_column_was_removed_it_is(paired: Path, tmp_path: Path, removed: str) -> None:
+    whole, at = Dataset.open(paired), tmp_path / "left"
+    left = [column for column in whole.schema if column.name != removed]
+    kept = (replace(one, columns={c.name: one.columns[c.name] for c in left}) for one in whole.episodes())
+    description = {"name": "left", "stage": "import", "environment": whole.description["environment"]}
+    part = write_fake(at, kept, columns=left, description=description)
+    again = Dataset.open(pair("antmaze-umaze", dataset=at, out=tmp_path / "out"))
+    assert again.content_hash == whole.content_hash and again.reference == "left@data-2.0.0"
+    assert again.description["parents"] == [part.identity]
 
 
 def test_the_step_that_is_told_is_that_of_the_dataset(
@@ -228,49 +212,36 @@ def test_the_step_that_is_told_is_that_of_the_dataset(
     assert told is not None
     source, step, entry = Dataset.open(collected), int(told[1]), "xy".index(told[2])
     assert source.lengths[0] <= step < source.lengths[:2].sum()
-    assert float(told[3]) == pytest.approx(source.columns([STATE])[STATE][step, entry], rel=1e-5)
-    lost = f"stepped from φ(s) of step {source.lengths[0] + 3}, gives y = "
+    assert float(told[3]) == pytest.approx(source.columns([keys.STATE])[keys.STATE][step, entry], rel=1e-5)
+    lost = f"stepped from φ(s) of step {source.lengths[0] + 3}, gives y = "  # in the fourth row of the second step
+    loses = "self.steps += 1; super().step(action)[3, 1] /= float(self.steps < 2); return self.state"
     with pytest.raises(BadInputError, match=re.escape(lost)):
-        pair(glider_that_gets_lost(tmp_path), dataset=collected, out=out)
+        pair(glider(tmp_path, "Lost", "steps = 0", f"def step(self, action): {loses}"), dataset=collected, out=out)
 
 
-@pytest.mark.parametrize(
-    ("unit", "half", "scale"),
-    [
-        (", astra={'unit': ('m', 'rad')}", "π", 1.0),
-        ("", "π", 1.0),
-        (", astra={'unit': ('m', 'deg')}", "180°", 57.29578),
-        (", astra={'unit': ('m', '1')}", "180°", 57.29578),
-    ],
-)
+@pytest.mark.parametrize(("unit", "half"), [("rad", "π"), ("", "π"), ("deg", "180°"), ("1", "180°")])
 def test_a_heading_that_wraps_is_told(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-    unit: str,
-    half: str,
-    scale: float,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, unit: str, half: str
 ) -> None:
+    scale, units = 57.29578 if half == "180°" else 1.0, f", astra={{'unit': ('m', '{unit}')}}" if unit else ""
     monkeypatch.setattr("astra_data.pipeline.stages.pair._BLOCK", 1)
     (tmp_path / "cart.py").write_text(
         "import torch\nfrom astra_data import Column\n"
         "class Turning:\n"
-        f"    abstract_state = Column('abstract.state', size=2, names=('x', 'yaw'){unit})\n"
+        f"    abstract_state = Column('abstract.state', size=2, names=('x', 'yaw'){units})\n"
         "    parameters = {}\n"
-        "    def __init__(self, num_envs):\n"
-        "        self.state = torch.zeros(num_envs, 2)\n"
+        "    def __init__(self, num_envs): self.state = torch.zeros(num_envs, 2)\n"
         "    def abstraction(state):\n"
         "        abstract = state[..., [0, 2]]\n"
         f"        abstract[..., 1] = {scale} * abstract[..., 1] - {180 * (scale > 1)}\n"
         "        return abstract\n"
-        "    def reset_to(self, state, rows=None):\n"
-        "        self.state = state.clone()\n"
+        "    def reset_to(self, state, rows=None): self.state = state.clone()\n"
         "    def step(self, command):\n"
         f"        self.state = self.state + command[:, [0, 1]] * torch.tensor([100.0, {0.05 * scale}])\n"
         "        return self.state\n"
     )
     logs = write_logs(tmp_path / "logs")
-    yaw, turned = (logs.columns([name])[name][:, 2] for name in (STATE, NEXT_STATE))
+    yaw, turned = (logs.columns([name])[name][:, 2] for name in (keys.STATE, keys.NEXT_STATE))
     wraps = int((np.abs(turned - yaw) > 6).sum())
     assert wraps > 3
     pair(f"{tmp_path}/cart.py:Turning", dataset=logs.root, out=tmp_path / "out")
