@@ -76,6 +76,7 @@ def test_comments_and_methods_that_come_and_go_outdate_nothing(made: Path) -> No
 
 def test_all_is_outdated_by_another_task_and_its_rows_by_another_method(made: Path) -> None:
     edit(made / "mine.py", "METHOD = ", "EXTRA = METHOD = ")
+    assert outdated(made) == dict.fromkeys([f"{stage}/mine" for stage in ROWS], "mine.py changed")
     edit(made / "rail.py", "0.1 * command", "0.2 * command")
     found = outdated(made)
     assert found["collect"] == found["pair"] == found["train/nas"] == "rail.py changed"
@@ -184,16 +185,13 @@ def test_files_are_looked_up_beside_the_recipe() -> None:
     assert looked_up(given, Path("there")) == {"a": a, "b": b, "c": {"method": "package.mod:METHOD"}, "d": 7}
 
 
-def test_those_that_packages_offer_are_named_as_if_the_recipe_gave_their_places(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_those_that_packages_offer_are_as_if_the_recipe_gave_their_places(monkeypatch: pytest.MonkeyPatch) -> None:
     offered = {"theirs": "their.module:METHOD", "unused": "no.module:METHOD", "nas": "no.module:METHOD"}
     monkeypatch.setattr("astra_data.methods.offered", lambda _: offered)
     tables = {"methods": ["nas", "theirs_plus"], "theirs": {"memory": 5}, "user_methods": {"mine": DELTA}}
-    assert with_offered(tables, ("methods", "user_methods")) == {
-        "methods": ["nas", "theirs_plus"],
-        "user_methods": {"mine": DELTA, "theirs": {"memory": 5, "method": "their.module:METHOD"}},
-    }
+    both = {"mine": DELTA, "theirs": {"memory": 5, "method": "their.module:METHOD"}}
+    found = with_offered(tables, ("methods", "user_methods"))
+    assert found == {"methods": ["nas", "theirs_plus"], "user_methods": both}
     for as_it_is in ({"methods": ["nas"], "mine": {}}, {"methods": "theirs"}, {"theirs": 5}):
         assert with_offered(as_it_is, ("methods", "user_methods")) == as_it_is
     given = {"methods": ["theirs"], "user_methods": {"theirs": DELTA}}
