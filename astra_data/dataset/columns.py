@@ -7,6 +7,7 @@ A column with one value per step has shape (T,), all others (T, size): never (T,
 """
 
 import hashlib
+import re
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import chain
@@ -43,11 +44,12 @@ ROLES = {"position": 2, "vector": 2, "heading": 1, "quaternion": 4, "invariant":
 """How a change of the planar frame acts on values (see `Column.astra`), and on how many of them at once."""
 Array = NDArray[Any]
 Scalar = float | int | bool | str
+_SURROGATE = re.compile("[\ud800-\udfff]")
 
 
 def is_text(value: object) -> TypeGuard[str]:
     """Return whether `value` is a text that can be written as UTF-8; names of files that are not UTF-8 cannot."""
-    return isinstance(value, str) and not any("\ud800" <= character <= "\udfff" for character in value)
+    return isinstance(value, str) and not _SURROGATE.search(value)
 
 
 @dataclass(frozen=True)
