@@ -24,11 +24,14 @@ def subset(
     root: arguments.Root = RUNS,
 ) -> None:
     """Write a random subset; with the same seed, smaller subsets are contained in larger ones."""
-    size: dict[str, Any] = {"episodes": episodes, "percent": percent, "of": of}
-    own = size | {"name": name, "out": out}
+    own = {"episodes": episodes, "percent": percent, "of": of, "name": name, "out": out}
     if arguments.of_recipe(dataset, "subset", own, table="sweep", seeds=seeds, jobs=jobs, root=root):
         return
-    _write("subset", dataset, **size, seed=seeds[0] if seeds else None, name=name, out=out)
+    from astra_data.dataset.edit import subset as write
+    from astra_data.dataset.versions import open_dataset
+
+    seed, source = seeds[0] if seeds else None, open_dataset(dataset)
+    _report(write(source, episodes=episodes, percent=percent, of=of, seed=seed, name=name, out=out))
 
 
 def merge(
@@ -58,9 +61,12 @@ def filter_(
     out: arguments.Out = None,
 ) -> None:
     """Write a dataset of the episodes that meet every given condition, without some of them."""
+    from astra_data.dataset.edit import filter_episodes
+    from astra_data.dataset.versions import open_dataset
+
     conditions: dict[str, Any] = {"success": success, "min_return": min_return, "max_return": max_return}
     conditions |= {"min_length": min_length, "max_length": max_length, "without": without or ()}
-    _write("filter_episodes", dataset, **conditions, name=name, out=out)
+    _report(filter_episodes(open_dataset(dataset), **conditions, name=name, out=out))
 
 
 def trim(
@@ -75,7 +81,10 @@ def trim(
     out: arguments.Out = None,
 ) -> None:
     """Write a dataset with shorter episodes, or without some of their steps."""
-    _write("trim", dataset, start_s=start, end_s=end, still=still, without=without, name=name, out=out)
+    from astra_data.dataset.edit import trim as write
+    from astra_data.dataset.versions import open_dataset
+
+    _report(write(open_dataset(dataset), start_s=start, end_s=end, still=still, without=without, name=name, out=out))
 
 
 def resample(
@@ -85,14 +94,17 @@ def resample(
     out: arguments.Out = None,
 ) -> None:
     """Write a dataset at another rate: commands held, states interpolated, times true."""
-    _write("resample", dataset, fps=fps, name=name, out=out)
+    from astra_data.dataset.edit import resample as write
+    from astra_data.dataset.versions import open_dataset
+
+    _report(write(open_dataset(dataset), fps, name=name, out=out))
 
 
 def features(
     dataset: arguments.DatasetName,
     camera: Annotated[str, typer.Option(help="A camera, such as front for observation.images.front.")],
     encoder: Annotated[
-        str | None, typer.Option(metavar="FILE.py:NAME", help="Yours; its code is run.", show_default="the package's")
+        str | None, typer.Option(metavar="FILE.py:NAME", help="Your own: its code runs.", show_default="the package's")
     ] = None,
     name: arguments.NewName = None,
     out: arguments.Out = None,
@@ -107,14 +119,6 @@ def features(
     with shown("features") as progress:
         folder = write(source, camera, encoder or DEFAULT, name=name, out=out, progress=progress)
     _report(folder)
-
-
-def _write(edit: str, dataset: str, **options: Any) -> None:
-    """Write what a function of `dataset.edit` makes of a dataset."""
-    from astra_data.dataset import edit as edits
-    from astra_data.dataset.versions import open_dataset
-
-    _report(getattr(edits, edit)(open_dataset(dataset), **options))
 
 
 def _report(folder: Path) -> None:
@@ -246,7 +250,7 @@ def repair(
         list[str] | None,
         typer.Option(metavar="ORIGINAL", help="What LeRobot's tools made DATASET from: its metadata are copied."),
     ] = None,
-    new_uids: Annotated[bool, typer.Option("--new-uids", help="Give new uids to episodes whose uid is taken.")] = False,
+    new_uids: Annotated[bool, typer.Option("--new-uids", help="Keep episodes of taken uids, under new ones.")] = False,
 ) -> None:
     """Recover the intact episodes of a damaged dataset, of astra-data or LeRobot, into a new one."""
     from astra_data.dataset.doctor.repair import repair as save

@@ -120,7 +120,7 @@ def evaluate(
     seeds: arguments.Seeds = None,
     jobs: arguments.Jobs = None,
     root: arguments.Root = RUNS,
-    policy: Annotated[str | None, typer.Option(help="Test your own policy, path.py:POLICY. Its code is run.")] = None,
+    policy: Annotated[str | None, typer.Option(help="Test this instead, path.py:POLICY. Its code is run.")] = None,
     out: Annotated[Path | None, typer.Option(help="With --policy: the folder to write.")] = None,
 ) -> None:
     """Run the policies in the target environment (if the task has one) and in simulators."""
@@ -362,7 +362,7 @@ _NAMED = 5  # files that are named in a line
 def new(
     name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the robot: a-z, 0-9 and _.")],
     logs: Annotated[list[Path] | None, typer.Option("--from", help="Logs: CSV files, folders, or a dataset.")] = None,
-    more: Annotated[list[Path] | None, typer.Argument(metavar="[LOG]...", help="More of --from logs/*.csv.")] = None,
+    more: Annotated[list[Path] | None, typer.Argument(metavar="[LOG]...", help="More logs: --from logs/*.csv.")] = None,
     out: Annotated[Path | None, typer.Option(help="The new folder.", show_default="NAME")] = None,
 ) -> None:
     """Start a project for your own robot: a task, a recipe, a mapping of its logs, a test and a page."""

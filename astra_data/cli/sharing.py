@@ -24,9 +24,9 @@ def import_(
     out: Out = None,
     name: Annotated[str | None, typer.Option(help="Name of the dataset.", show_default="the mapping's")] = None,
     fps: Annotated[int | None, typer.Option(min=1, help="Steps per second.", show_default="the mapping's")] = None,
-    task: Annotated[str | None, typer.Option(help="What the robot does in it.", show_default="the mapping's")] = None,
+    task: Annotated[str | None, typer.Option(help="What the robot does.", show_default="the mapping's")] = None,
     max_bytes: Annotated[
-        int | None, typer.Option(min=1, help="Refuse what unpacks to more.", show_default="100-fold, or 256 MB")
+        int | None, typer.Option(min=1, help="Refuse what unpacks to more bytes.", show_default="100 times, or 256 MB")
     ] = None,
     skip_bad: Annotated[bool, typer.Option("--skip-bad", help="Leave out, and list, what cannot be imported.")] = False,
 ) -> None:
@@ -92,7 +92,7 @@ def pull(
     source: Annotated[str, typer.Argument(metavar="SOURCE", help="user/name on the Hugging Face Hub, URL, or path.")],
     out: Out = None,
     version: Annotated[str | None, typer.Option(help="Version, such as 1.2.0.", show_default="the newest")] = None,
-    max_bytes: Annotated[int | None, typer.Option(min=1, help="Refuse larger datasets.", show_default="100 GB")] = None,
+    max_bytes: Annotated[int | None, typer.Option(min=1, help="Refuse more bytes.", show_default="100 GB")] = None,
 ) -> None:
     """Download and verify a shared dataset; run again to continue, or to verify the copy."""
     from astra_data.io.hub.sharing import MOST_BYTES
