@@ -410,7 +410,7 @@ def endings(
         line = "unknown: neither success nor next.terminated was recorded"
     found, failures = [], [uid for uid, failure in zip(uids, failed, strict=True) if failure]
     if limit == 1:
-        advice = "check what ends them: failed of the robot or log, reached and missed of the objective, or a mapping"
+        advice = "check what ends them: failed of robot or log, reached, missed of objective, or a mapping's [split]"
         found.append(Finding("warning", "every episode ends after its first step", advice))
     if 0 < len(failures) < FEW_FAILURES:
         count = "1 failure" if len(failures) == 1 else f"{len(failures)} failures"

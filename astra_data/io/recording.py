@@ -31,7 +31,8 @@ FOREIGN = {
     "state=..., action=...), and import that",
     (".db3", ".db3.zstd"): "a bag of ROS 2 in SQLite, expected MCAP: write `output_bags: [{uri: NEW, storage_id: "
     "mcap, all: true}]` to a file new.yaml, run `ros2 bag convert -i BAG -o new.yaml`, and import NEW",
-    (".gz", ".bz2", ".xz", ".zst", ".zstd", ".zip", ".7z"): "compressed: unpack it (gunzip, bunzip2, unxz, unzstd, 7z)",
+    (".gz", ".bz2", ".xz", ".zst", ".zstd", ".zip", ".7z"): "compressed: unpack it (gunzip, bunzip2, unxz, "
+    "unzstd, unzip)",
     (".bag",): "a bag of ROS 1: run `uvx --from rosbags rosbags-convert --src FILE --dst NEW --dst-storage "
     "mcap`, and import NEW with a mapping like recipes/imports/ros2_base.toml",
     (".ulg",): "a log of PX4: run `uvx --from pyulog ulog2csv FILE`, and import the folder of its CSVs, "
