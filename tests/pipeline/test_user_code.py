@@ -127,7 +127,7 @@ def test_no_command_takes_a_run_of_another_task(asked: str, made: Path, monkeypa
     edit(made / "rail.py", '"v": (-1.0, 4.0)', '"v": (-1.0, 9.0)')
     before = sorted(made.rglob("*"))
     shown = CliRunner().invoke(app, asked.split())
-    assert str(shown.exception) == (
+    assert isinstance(shown.exception, BadInputError) and str(shown.exception) == (
         f"{made}/rail.py changed since runs/rail was made: restore that version, or run the recipe under another name"
     )
     assert sorted(made.rglob("*")) == before
@@ -169,14 +169,15 @@ def test_the_process_of_an_item_has_the_code_the_run_began_with(made: Path, monk
     told, own = list[int](), UserMethod.model_validate(f"{made}/mine.py:METHOD")
     prepare = partial(_prepare, f"{made}/rail.py:TASK", {"mine": own}, made / "runs/rail")
     monkeypatch.setattr("torch.set_num_threads", told.append)
-    edit(made / "rail.py", "0.1 * command", "0.5 * command")
-    with pytest.raises(BadInputError, match=r"rail\.py changed since .*runs/rail was made: restore that version"):
-        prepare()
-    edit(made / "rail.py", "0.5 * command", "0.1 * command")
+    for file, old, new in (("rail.py", "0.1 * command", "0.5 * command"), ("mine.py", "float = 3e-3", "float = 3e-4")):
+        edit(made / file, old, new)
+        with pytest.raises(BadInputError, match=rf"{file} changed since .*runs/rail was made: restore that version"):
+            prepare()
+        edit(made / file, new, old)
     prepare()
-    edit(made / "mine.py", "learning_rate: float = 3e-3", "learning_rate: float = 3e-4")
+    edit(made / "mine.py", old, new)
     prepare()  # what it has loaded is not edited
-    assert "mine" in METHODS and told == [1, 1, 1]
+    assert "mine" in METHODS and told == [1, 1, 1, 1]
 
 
 def test_files_are_looked_up_beside_the_recipe() -> None:
