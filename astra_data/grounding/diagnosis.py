@@ -113,8 +113,9 @@ def diagnose(dataset: str | Path, simulator: str, progress: Progress = silent) -
         *_of_commands(log, commands),
         *(_of_forecast(forecast, missed) if known.error.size else ()),
     )
-    size = recordings, len(log.step)
-    return Diagnosis(source.reference, *size, responses, missed, commands, explained, forecast, findings)
+    return Diagnosis(
+        source.reference, recordings, len(log.step), responses, missed, commands, explained, forecast, findings
+    )
 
 
 @dataclass(frozen=True)

@@ -221,7 +221,7 @@ def fit_failures(
             for parameter in (model.members.last_weight, model.members.last_bias):
                 parameter.mul_(scale)
         model.log_odds_shift.copy_(shift)
-    gains = [{"latent": bool(number), "nats_per_failure": of and of[0]} for number, (of, *_) in enumerate(candidates)]
+    gains = [{"latent": bool(at), "nats_per_failure": fit and fit[0]} for at, (fit, *_) in enumerate(candidates)]
     figures = {"latent": bool(model.shape.latent_size), "candidates": gains}
     return model.requires_grad_(False).eval(), figures
 

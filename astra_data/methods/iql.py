@@ -238,8 +238,8 @@ def learn_from_episodes(training: Training) -> tuple[PolicyFile, dict[str, Any]]
     experience = experience_of(training.task, episodes)
     torch.manual_seed(derive(training.seed, "policy"))
     if training.initial is None:
-        seen, given = experience.observation.shape[-1] - _position_features(training.task).size, training.config
-        shape = PolicyShape(seen, experience.action.shape[-1], given.memory_size, hidden_sizes=given.hidden_sizes)
+        observed, sizes = experience.observation.shape[-1] - _position_features(training.task).size, training.config
+        shape = PolicyShape(observed, experience.action.shape[-1], sizes.memory_size, hidden_sizes=sizes.hidden_sizes)
         policy: Policy = ActorCritic(shape).to(training.device)
     else:
         policy = copy.deepcopy(training.initial.policy).requires_grad_(True)
@@ -282,7 +282,13 @@ def experience_of(task: Task, episodes: PairedEpisodes) -> Experience:
         for state in (windows.state, windows.next_state)
     )
     return Experience(
-        now, windows.previous_action, windows.action, episodes.lengths, episodes.reward, later, episodes.terminated
+        observation=now,
+        previous_action=windows.previous_action,
+        action=windows.action,
+        lengths=episodes.lengths,
+        reward=episodes.reward,
+        next_observation=later,
+        terminated=episodes.terminated,
     )
 
 

@@ -144,9 +144,9 @@ def run_stage(
     recipe, folder = experiment.recipe, experiment.folder
     if stage == "collect" and recipe.data is not None:
         raise BadInputError(f"{recipe_path} uses the data {recipe.data}: there is nothing to collect")
-    part = selected(recipe, methods, seeds)
-    to: dict[str, Any] = {"publish": experiment.results, "published": experiment.published()} if publish else {}
-    planned = plan(recipe, recipe_path, folder, part, device=device, reports=part, **to)
+    part, results = selected(recipe, methods, seeds), experiment.results if publish else None
+    published = experiment.published() if publish else ()
+    planned = plan(recipe, recipe_path, folder, part, device=device, reports=part, publish=results, published=published)
     make(experiment, _selected(planned, stage, methods), planned, part, jobs=jobs, device=device)
     return folder / stage
 
@@ -309,7 +309,8 @@ def _selected(items: tuple[Item, ...], stage: str, methods: Sequence[str]) -> li
 def _write_points(experiment: Experiment) -> dict[str, dict[str, Any]]:
     """Write the lines of all points that are finished now, if there are any, to `sweep.csv`, and return them."""
     points = selected(experiment.recipe).points().items()
-    lines = {key: _line(experiment, key, at) for key, at in points if (experiment.folder / key / EVALUATION).is_file()}
+    finished = {key: point for key, point in points if (experiment.folder / key / EVALUATION).is_file()}
+    lines = {key: _line(experiment, key, point) for key, point in finished.items()}
     if lines:
         text = StringIO()
         writer = csv.DictWriter(text, [*next(iter(lines.values()))], lineterminator="\n")

@@ -63,7 +63,7 @@ def gap_blocks(results: Results) -> Iterator[Block]:
     horizons = sorted(set.intersection(*(set(of.index.get_level_values("horizon")) for of in means.values())))
     quantities = list(dict.fromkeys(error.quantity for error in results.errors))
     step_s = results.timestep_s
-    titles = [f"{steps} step{'s' * (steps > 1)}{f' ({steps * step_s:.3g} s)' if step_s else ''}" for steps in horizons]
+    titles = [f"{n} step{'s' if n > 1 else ''}{f' ({n * step_s:.3g} s)' if step_s else ''}" for n in horizons]
     head = [*_size(results), "simulator", *titles]
     for quantity in quantities:
         lines = [
@@ -149,7 +149,7 @@ def _regressions(results: Results, means: "pd.DataFrame") -> Iterator[str]:
         worse = of[(of["grounded"] > of["raw"]) & apart & (of["grounded"] > _EXACT * of.get("still", 0.0))]
         for quantity, lines in worse.groupby(level="quantity", sort=False):
             found = [
-                f"{steps} step{'s' * (steps > 1)} ahead ({line['grounded']:.3g}, without {line['raw']:.3g})"
+                f"{steps} step{'s' if steps > 1 else ''} ahead ({line['grounded']:.3g}, without {line['raw']:.3g})"
                 for (_, steps), line in lines.iterrows()
             ]
             yield f"`{quantity}`, {method_title(row)}: {', '.join(found)}"

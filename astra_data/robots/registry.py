@@ -75,9 +75,17 @@ def pairing_named(name: str) -> Pairing:
     else:
         made = task_named(name, besides=tuple(installed))
     if isinstance(made, Task):
-        origin, commands = {"task": made.name, **file_of(name)}, None if made.limits.are_normal else made.limits
-        about = made.plane, made.abstract_state, made.abstraction, made.own_simulator, commands, made.fps
-        return Pairing(made.simulator_id, origin, *about, (made.state, made.action))
+        return Pairing(
+            id=made.simulator_id,
+            origin={"task": made.name, **file_of(name)},
+            maze=made.plane,
+            abstract_state=made.abstract_state,
+            abstraction=made.abstraction,
+            simulator=made.own_simulator,
+            commands=None if made.limits.are_normal else made.limits,
+            fps=made.fps,
+            columns=(made.state, made.action),
+        )
     needed = ("abstract_state", "abstraction", "parameters", "reset_to", "step")
     if missing := [attribute for attribute in needed if not hasattr(made, attribute)]:
         expected = "expected what a Simulator has, see astra_data.worlds.protocols"

@@ -115,7 +115,7 @@ class GymnasiumRobot:
         return action
 
 
-_SAME: dict[str, Any] = {"rtol": 1e-4, "atol": 1e-4}  # of a state that was written and read again: states are float32
+_TOLERANCE = 1e-4  # of a state that was written and read again: states are float32
 
 
 class GymnasiumSimulator(NumpySimulator):
@@ -156,7 +156,7 @@ class GymnasiumSimulator(NumpySimulator):
                 if not is_checked:
                     env.reset(seed=0)
                     write(inner, written := landed[row])
-                    if not np.allclose(found := shown(inner), written, **_SAME):
+                    if not np.allclose(found := shown(inner), written, rtol=_TOLERANCE, atol=_TOLERANCE):
                         raise BadInputError(
                             f"{env_id}: after write(env, {written.tolist()}) expected the same of read(env), "
                             f"got {found.tolist()}: write has to set what read returns"

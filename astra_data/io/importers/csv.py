@@ -238,6 +238,7 @@ def numbers_of(texts: pa.StringArray, source: Source, field: str) -> Array:
         except ValueError:
             rows.append([])
         if not rows[-1] or len(rows[-1]) != len(rows[0]):
-            got = f"{len(rows[0]) or 'some'} numbers as in the rows before, got '{shortened(str(texts[row]), _SHOWN)}'"
-            raise BadInputError(f"{source} line {line_of(source, row)}: field '{field}': expected a list of {got}")
+            where = f"{source} line {line_of(source, row)}: field '{field}'"
+            wanted = f"a list of {len(rows[0]) or 'some'} numbers as in the rows before"
+            raise BadInputError(f"{where}: expected {wanted}, got '{shortened(str(texts[row]), _SHOWN)}'")
     return np.array(rows)
