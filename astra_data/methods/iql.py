@@ -167,9 +167,7 @@ class Iql:
         if self._weights is None:
             self._weights = self._weigh()
         steps, is_learned = self._experience.draw(config.batch_windows, config.window, config.burn_in)
-        seen = self._experience.observation[..., : policy.shape.observation_size][steps]
-        before, start = self._experience.previous_action[steps], torch.zeros_like(is_learned, dtype=torch.float32)
-        features = policy.remember_sequence(seen, before, policy.initial_hidden(len(seen)), start)
+        features = self._experience.features(policy, steps)
         learned = is_learned.nonzero(as_tuple=True)
         likelihood = policy.log_prob(features[learned], self._experience.action[steps][learned])
         loss = -(self._weights[steps][learned] * likelihood).mean()

@@ -178,11 +178,9 @@ class Sac(Learner):
 
     def _distance(self, recorded: "Recorded") -> Tensor:
         """Return the mean squared distance of the policy's actions, without exploration, from recorded ones."""
-        steps, learned = recorded.draw(self.config.batch_size // self._window, self._window, self._burn_in)
-        start = torch.zeros_like(learned, dtype=torch.float32)
-        seen = recorded.observation[steps], recorded.previous_action[steps]
-        features = self.policy.remember_sequence(*seen, self.policy.initial_hidden(len(learned)), start)
-        return (self.policy.act(features[learned]) - recorded.action[steps][learned]).square().mean()
+        places, learned = recorded.draw(self.config.batch_size // self._window, self._window, self._burn_in)
+        features = recorded.features(self.policy, places)
+        return (self.policy.act(features[learned]) - recorded.action[places][learned]).square().mean()
 
 
 class Replay:

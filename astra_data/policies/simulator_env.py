@@ -1,7 +1,7 @@
 """The task in an abstract simulator, raw or grounded: the environment that policies are trained in."""
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -14,6 +14,9 @@ from astra_data.worlds.objective import NO_LIMIT, Objective
 from astra_data.worlds.protocols import Step
 from astra_data.worlds.task import Task
 from astra_data.worlds.variation import Variation
+
+if TYPE_CHECKING:
+    from astra_data.policies.networks import Policy
 
 RewardSource = Literal["abstract", "predicted", "priced"]
 """The task's own reward on abstract states; the target's, as R_pred predicts it (Algorithm 2), but where states decide;
@@ -68,6 +71,12 @@ class Recorded:
         learned &= steps < self.lengths[episodes]
         learned &= (torch.arange(steps.shape[1], device=steps.device) >= burn_in) | (steps[:, :1] == 0)
         return (episodes, steps), learned
+
+    def features(self, policy: "Policy", places: tuple[Tensor, Tensor]) -> Tensor:
+        """Return the `policy`'s features (count, length, F) of windows as drawn, which it begins without memory."""
+        seen = self.observation[..., : policy.shape.observation_size][places]
+        start = torch.zeros(seen.shape[:2], device=seen.device)
+        return policy.remember_sequence(seen, self.previous_action[places], policy.initial_hidden(len(seen)), start)
 
 
 @without_gradients
