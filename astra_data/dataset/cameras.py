@@ -95,11 +95,17 @@ def _indexed(clip: Clip) -> _Index:
     return _index(clip.path, clip.digest, clip.path.stat().st_mtime_ns)
 
 
+@lru_cache(maxsize=4096)
+def _digest(path: Path, _changed_ns: int) -> str:
+    """Return the digest of a video, which many clips ask for, as long as it does not change."""
+    return file_digest(path)
+
+
 @lru_cache(maxsize=8)
-def _index(path: Path, digest: str | None, _changed_ns: int) -> _Index:
+def _index(path: Path, digest: str | None, changed_ns: int) -> _Index:
     import av  # noqa: PLC0415 - slow
 
-    if digest and file_digest(path) != digest:
+    if digest and _digest(path, changed_ns) != digest:
         raise CorruptDatasetError(f"{path} was altered after it was written")
     try:
         with av.open(str(path)) as container:
@@ -229,7 +235,7 @@ def clip_fault(clip: Clip) -> str | None:
 def altered_videos(clips: Iterable[Clip]) -> set[Path]:
     """Return the videos of `clips` that are not as they were written."""
     written = {clip.path: clip.digest for clip in clips if clip.digest and clip.path.is_file()}
-    return {path for path, digest in written.items() if file_digest(path) != digest}
+    return {path for path, digest in written.items() if _digest(path, path.stat().st_mtime_ns) != digest}
 
 
 def encoded_again(clips: Mapping[int, Clip]) -> Iterator[tuple[int, Clip]]:
