@@ -29,8 +29,12 @@ _DEFAULTS |= {"config": {}, "seeds": {}, "environment": {}, "simulator": {}}
 digest_of = xxh3_64_intdigest  # of contiguous values (T,) or (T, size) of one episode
 Digests = Mapping[str, NDArray[np.uint64]]  # column to the digest of each episode, (E,)
 SEALED = (
-    *(layout.INFO_PATH, layout.STATS_PATH, layout.TASKS_PATH),
-    *(layout.METADATA_PATH, layout.SUBSETS_PATH, layout.DIGESTS_PATH),
+    layout.INFO_PATH,
+    layout.STATS_PATH,
+    layout.TASKS_PATH,
+    layout.METADATA_PATH,
+    layout.SUBSETS_PATH,
+    layout.DIGESTS_PATH,
 )  # the files with a sum, beside the description and those of meta/episodes
 
 

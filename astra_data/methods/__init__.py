@@ -24,9 +24,19 @@ from astra_data.worlds.user_code import offered, user_object
 METHODS: dict[str, Method] = {
     method.name: method
     for method in (
-        *(astra.DIRECT_TRANSFER, astra.DOMAIN_RANDOMIZATION, astra.NAS, RMA, astra.TARGET, astra.FULL_OBS),
-        *(astra.COMPASS, iql.IQL, iql.BEHAVIOR_CLONING, iql.DIRECT_TRANSFER_IQL),
-        *(astra.ASTRA, *astra.ABLATIONS, follower.FOLLOWER),
+        astra.DIRECT_TRANSFER,
+        astra.DOMAIN_RANDOMIZATION,
+        astra.NAS,
+        RMA,
+        astra.TARGET,
+        astra.FULL_OBS,
+        astra.COMPASS,
+        iql.IQL,
+        iql.BEHAVIOR_CLONING,
+        iql.DIRECT_TRANSFER_IQL,
+        astra.ASTRA,
+        *astra.ABLATIONS,
+        follower.FOLLOWER,
     )
 }  # by name. Recipes list the methods' tables, and results the settings in them, in this order.
 

@@ -236,8 +236,12 @@ def learn_from_episodes(training: Training) -> tuple[PolicyFile, dict[str, Any]]
     experience = experience_of(training.task, episodes)
     torch.manual_seed(derive(training.seed, "policy"))
     if training.initial is None:
-        observed, sizes = experience.observation.shape[-1] - _position_features(training.task).size, training.config
-        shape = PolicyShape(observed, experience.action.shape[-1], sizes.memory_size, hidden_sizes=sizes.hidden_sizes)
+        shape = PolicyShape(
+            observation_size=experience.observation.shape[-1] - _position_features(training.task).size,
+            action_size=experience.action.shape[-1],
+            memory_size=training.config.memory_size,
+            hidden_sizes=training.config.hidden_sizes,
+        )
         policy: Policy = ActorCritic(shape).to(training.device)
     else:
         policy = copy.deepcopy(training.initial.policy).requires_grad_(True)

@@ -12,8 +12,11 @@ from astra_data.core.artifact import check_intact
 from astra_data.core.config import read_written
 from astra_data.core.errors import BadInputError
 
-EVALUATION, TRAJECTORIES = "evaluation.json", "trajectories.safetensors"
-CURVE, METRICS, GAP = "curve.json", "metrics.json", "gap.json"
+EVALUATION = "evaluation.json"
+TRAJECTORIES = "trajectories.safetensors"
+CURVE = "curve.json"
+METRICS = "metrics.json"
+GAP = "gap.json"
 
 
 class WrittenPart(BaseModel):

@@ -189,10 +189,23 @@ def read_run(
         )
     code = ["task", *(name for row in rows for name in (base_method(row), grounded_as(row)))]
     recorded = recorded_code(root)
-    facts |= {"recipe": reported.name, "task": reported.task, "settings": dict(reported.settings)}
-    facts |= {"command": command, "rows": rows, "scores": scores, "judged": judgment, "trials": trials}
-    facts |= {"episodes": first.episodes, "leg_scale": first.leg_scale, "datasets": [*dict.fromkeys(uses)]}
-    facts["tested_in"] = "target" if all(file.target for file in files) else "simulators"
-    facts["user_code"] = {name: recorded[name] for name in dict.fromkeys(code) if name in recorded}
-    facts |= {"origins": results.merged_origins(run.origins), "lines": run.lines}
-    return results.Results.model_validate(facts | {"errors": run.errors, "trainings": trainings})
+    made = {
+        "recipe": reported.name,
+        "task": reported.task,
+        "command": command,
+        "rows": rows,
+        "scores": scores,
+        "episodes": first.episodes,
+        "tested_in": "target" if all(file.target for file in files) else "simulators",
+        "leg_scale": first.leg_scale,
+        "settings": dict(reported.settings),
+        "origins": results.merged_origins(run.origins),
+        "user_code": {name: recorded[name] for name in dict.fromkeys(code) if name in recorded},
+        "judged": judgment,
+        "trials": trials,
+        "datasets": [*dict.fromkeys(uses)],
+        "lines": run.lines,
+        "errors": run.errors,
+        "trainings": trainings,
+    }
+    return results.Results.model_validate(made | facts)

@@ -95,8 +95,8 @@ def align(
         alike |= {"position_octaves": 0, "sensing": sensing}
     encoder = TargetEncoder(episodes.target_state.shape[-1], shape.goal_size, shape.action_size, **alike).to(device)
     # Where φ drops the robot's place, latents must not depend on where it came from.
-    seen = training.steps(training.target_state), training.steps(training.windows.goal)
-    encoder.set_scales(*seen, training.dropped_place, abstract)
+    state, goal = training.steps(training.target_state), training.steps(training.windows.goal)
+    encoder.set_scales(state, goal, training.dropped_place, abstract)
     bandwidths = torch.tensor(_BANDWIDTHS, device=device) * shape.latent_size**0.5
     grounding_digest = file_digest(grounding_file)
     settings_text = as_json(**episodes.named, grounding_sha256=grounding_digest, seed=seed, align=config)

@@ -119,9 +119,11 @@ def evaluate(
     tensors: dict[str, Tensor] = {}
     if world.has_target:
         drawn = derive(seed, "evaluation")
-        how: dict[str, Any] = {"leg_scale": config.leg_scale, "num_threads": num_threads, "progress": progress}
+        options: dict[str, Any] = {"leg_scale": config.leg_scale, "num_threads": num_threads, "progress": progress}
         tested = {
-            kind: in_target(world, robot, config.episodes, drawn, **how, asked=asked if kind == row.headline else None)
+            kind: in_target(
+                world, robot, config.episodes, drawn, **options, asked=asked if kind == row.headline else None
+            )
             for kind, robot in row.robots.items()
         }
         if len(tested) > 1:

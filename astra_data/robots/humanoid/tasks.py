@@ -350,8 +350,12 @@ _BODY_QUANTITIES = _JOINT_QUANTITIES | {
     for name, first in {"mass_m": 0, "mass_velocity_m_s": 3, "up": 6, "spin_rad_s": 9}.items()
 }
 _WALKER_QUANTITIES: Quantities = {
-    **{"height_m": (0,), "pitch_rad": (1,), "joints_rad": (2, 3, 4, 5)},
-    **{"velocity_m_s": (6, 7), "pitch_rate_rad_s": (8,), "joint_rates_rad_s": (9, 10, 11, 12)},
+    "height_m": (0,),
+    "pitch_rad": (1,),
+    "joints_rad": (2, 3, 4, 5),
+    "velocity_m_s": (6, 7),
+    "pitch_rate_rad_s": (8,),
+    "joint_rates_rad_s": (9, 10, 11, 12),
 }
 
 
