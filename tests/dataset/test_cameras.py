@@ -169,7 +169,8 @@ def test_an_altered_video_is_refused_and_costs_its_episode_alone(source: Dataset
     video.write_bytes(content)
     assert check(root).faults == [f"{FRONT} in episode 0: {video} was altered after it was written"]
     assert Dataset.open(root).verify() == [f"{video} was altered after it was written"]
-    with pytest.raises(CorruptDatasetError, match="altered after it was written: `astra-data repair DATASET --out "):
+    altered = "was altered after it was written: `astra-data repair DATASET --out "
+    with pytest.raises(CorruptDatasetError, match=altered):
         subset(Dataset.open(root), percent=100, out=tmp_path / "all")
     assert not (tmp_path / "all").exists()
     notes = repair(root, out=tmp_path / "repaired").notes

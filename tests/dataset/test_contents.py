@@ -44,7 +44,7 @@ def test_damage_is_told_in_one_line(root: Path, damage: Callable[[Path], object]
         Dataset.open(root)
     message = str(caught.value)
     assert message.startswith(f"{root} is incomplete or was altered: ")
-    repair = f"or recover its intact episodes: `astra-data repair {root} --out FOLDER`, with `--like ORIGINAL` if "
-    assert repair in message and "\n" not in message
+    repair = f"`astra-data repair {root} --out FOLDER`, with `--like ORIGINAL` if LeRobot's tools edited it."
+    assert message.endswith(f"or recover its intact episodes: {repair}") and "\n" not in message
     for part in parts:
         assert part in message

@@ -127,7 +127,8 @@ def test_no_command_takes_a_run_of_another_task(asked: str, made: Path, monkeypa
     edit(made / "rail.py", '"v": (-1.0, 4.0)', '"v": (-1.0, 9.0)')
     before = sorted(made.rglob("*"))
     shown = CliRunner().invoke(app, asked.split())
-    assert isinstance(shown.exception, BadInputError) and str(shown.exception) == (
+    assert shown.exit_code == 1 and isinstance(shown.exception, BadInputError)
+    assert str(shown.exception) == (
         f"{made}/rail.py changed since runs/rail was made: restore that version, or run the recipe under another name"
     )
     assert sorted(made.rglob("*")) == before
