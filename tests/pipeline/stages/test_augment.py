@@ -301,6 +301,15 @@ def test_code_that_a_dataset_names_is_not_run(collected: Path, tmp_path: Path) -
     assert not (tmp_path / "ran").exists()
 
 
+@pytest.mark.parametrize(("share", "is_moved"), [(1.0, True), (1.01, False)])
+def test_commands_at_their_limits_are_moved(collected: Path, share: float, is_moved: bool) -> None:
+    episode = next(Dataset.open(collected).episodes())
+    for end in np.array(list(TASKS[TASK].limits.values())).T:
+        episode.columns[ACTION][:] = share * end
+        moved = Relocation(TASKS[TASK], "none", False, 0.0, 5).placements(episode, np.random.default_rng(0))
+        assert any(moved) == is_moved
+
+
 def test_balls_are_moved_with_their_robots(tmp_path: Path) -> None:
     kicking, task = tmp_path / "kicking", TASKS["nao-kick"]
     collect("nao-kick", CollectConfig(episodes=3, max_steps=20), out=kicking)
