@@ -77,7 +77,7 @@ class Ppo(Learner):
         for group in self._optimizer.param_groups:
             group["lr"] = self.config.learning_rate * (1.0 - self.share)
         self._learn(self._collect())
-        faded = min(1.0, (1.0 - (1.0 - self.share)) / _FADE_SHARE)
+        faded = min(1.0, self.share / _FADE_SHARE)
         with torch.no_grad():
             self.policy.log_std.clamp_(max=math.log(self._first_std) + faded * math.log(_FINAL_STD / self._first_std))
         figures = {"std": float(self.policy.log_std.detach().exp().mean())}
