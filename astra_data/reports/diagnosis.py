@@ -16,7 +16,12 @@ def diagnosis_page(recipe: str, found: Diagnosis, timestep_s: float) -> str:
     """Return the page of a diagnosis in Markdown."""
     findings = [f"**{one.what}**: {one.advice}." for one in found.findings]
     delays = [
-        [one.name, _with_ends(one.delay_s) if one.is_visible else "-", _with_ends(one.gain), _bars(one.weights)]
+        [
+            one.name,
+            interval(Estimate(*one.delay_s), 3) if one.is_visible else "-",
+            interval(Estimate(*one.gain), 3),
+            _bars(one.weights),
+        ]
         for one in found.responses
     ]
     missed = [
@@ -44,7 +49,7 @@ def diagnosis_page(recipe: str, found: Diagnosis, timestep_s: float) -> str:
         Section("What the simulator misses, one step ahead", [TableBlock("", missed_head, missed, words=2)]),
     ]
     if found.explained:
-        lines = [[name, _with_ends(with_ends(value), 2)] for name, value in found.explained.items()]
+        lines = [[name, interval(Estimate(*with_ends(value)))] for name, value in found.explained.items()]
         text = (
             "R² on held-out recordings (0: nothing, 1: all of it), mean over the values that it misses, of a "
             "ridge regression on the values, and on the products of two where there are few. What each line explains "
@@ -67,11 +72,6 @@ def diagnosis_page(recipe: str, found: Diagnosis, timestep_s: float) -> str:
         table = TableBlock("", ["recordings", "left", "2.5 %", "97.5 %"], lines)
         sections.append(Section("Enough recordings?", [table, Text(text)]))
     return markdown(f"{recipe}: before any fit", sections)
-
-
-def _with_ends(values: tuple[float, float, float], digits: int = 3) -> str:
-    value, low, high = (round(value, digits) + 0.0 for value in values)  # never -0.00
-    return interval(Estimate(value, low, high), digits)
 
 
 def _bars(weights: Floats) -> str:

@@ -97,7 +97,7 @@ def gap_blocks(results: Results) -> Iterator[Block]:
     rows = results.groundings()
     found = {title: [results.summary(row, name, "ground") for row in rows] for name, title in _FITS.items()}
     if shown := {title: of for title, of in found.items() if any(of)}:
-        cells = [[f"{one.value:.2f}" if one else "-" for one in of] for of in shown.values()]
+        cells = [[f"{one.value:z.2f}" if one else "-" for one in of] for of in shown.values()]
         title = "R² of what groundings predict on held-out episodes (1: perfect; 0 or less: no better than the mean)"
         yield TableBlock(title, ["grounding", *shown], [*zip(map(method_title, rows), *cells, strict=True)])
     yield from _failure_blocks(results)
@@ -181,7 +181,7 @@ def _failure_blocks(results: Results) -> Iterator[Block]:
     for (percent, row, part), of in results.predicted_failures().items():
         means = of.mean(axis=1)
         names = (*(f"auc.{ahead}" for ahead in ("1-20", "11-30", "21-40")), "brier_skill")
-        known = [f"{means[name]:.2f}" if name in means else "-" for name in names]
+        known = [f"{means[name]:z.2f}" if name in means else "-" for name in names]
         bins, happens = all_bins(of), "-"
         if len(sure := bins[bins[:, 0] > _SURE]):
             predicted, observed = np.average(sure[:, :2], axis=0, weights=sure[:, 2])

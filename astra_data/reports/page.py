@@ -130,9 +130,8 @@ def _methods(results: Results) -> Iterator[Block]:
         columns.append(("paper", [f"{printed[row]:.2f}" if row in printed else "-" for row in rows]))
     learned = [results.score_of(row, SIMULATED) for row in rows]
     columns.append(("in its simulator", [spread(one, headline.digits) for one in learned]))
-    # A minus sign of a rounded zero says nothing.
     lost = [
-        f"{round(one.value - there.value, headline.digits) + 0.0:.{headline.digits}f}" if one and there else "-"
+        f"{one.value - there.value:z.{headline.digits}f}" if one and there else "-"
         for one, there in zip(learned, map(results.score_of, rows), strict=True)
     ]
     columns.append(("lost", lost))
@@ -268,7 +267,7 @@ def _sizes(results: Results) -> Iterator[Block]:
     for percent in results.percents:
         if choice := results.choice(percent):
             known = (choice.target(choice.best), choice.regret, choice.random_regret)
-            cells = ("-" if value is None else f"{value:.2f}" for value in known)
+            cells = ("-" if value is None else f"{value:z.2f}" for value in known)
             predicted = interval(choice.judged.estimate(choice.best))
             lines.append([f"{percent} %", choice.best.name, predicted, *cells])
     head = ["size", "chosen", "predicted [95 %]", "in the target", "regret", "regret at random"]

@@ -42,19 +42,19 @@ def spread(found: Estimate | None, digits: int) -> str:
     """Return a mean ± its standard deviation; a dash for None."""
     if found is None:
         return "-"
-    return f"{found.value:.{digits}f}" + ("" if found.std is None else f" ± {found.std:.{digits}f}")
+    return f"{found.value:z.{digits}f}" + ("" if found.std is None else f" ± {found.std:.{digits}f}")
 
 
 def ends(found: Estimate | None, digits: int = 2) -> str:
     """Return the interval of a figure; a dash where it has none."""
     if found is None or found.low is None or found.high is None:
         return "-"
-    return f"[{found.low:.{digits}f}, {found.high:.{digits}f}]"
+    return f"[{found.low:z.{digits}f}, {found.high:z.{digits}f}]"
 
 
 def interval(found: Estimate | None, digits: int = 2) -> str:
     """Return a figure and, if it has one, its interval; a dash for None."""
-    return "-" if found is None else f"{found.value:.{digits}f} {ends(found, digits)}".removesuffix(" -")
+    return "-" if found is None else f"{found.value:z.{digits}f} {ends(found, digits)}".removesuffix(" -")
 
 
 def summarize(scores: Sequence[float] | Floats, *, limit: float | None = None, trials: int = 0) -> Estimate:

@@ -178,7 +178,7 @@ def test_what_does_not_vary_correlates_with_nothing() -> None:
 def test_figures_are_written_with_deviation_or_interval() -> None:
     found = Estimate(0.5, 0.125, 1.0, std=0.25, seeds=3)
     assert (spread(found, 2), ends(found), interval(found)) == ("0.50 ± 0.25", "[0.12, 1.00]", "0.50 [0.12, 1.00]")
-    assert (spread(Estimate(0.5), 0), interval(Estimate(0.5), 1)) == ("0", "0.5")
+    assert (spread(Estimate(-0.4), 0), interval(Estimate(-0.01, -0.04, 0.0), 1)) == ("0", "0.0 [0.0, 0.0]")
     assert (spread(None, 2), ends(None), interval(None)) == ("-", "-", "-")
 
 
