@@ -177,8 +177,7 @@ def to_numpy(column: pa.ChunkedArray, size: int, dtype: str) -> Array:
     parts = [chunk.flatten() if size > 1 else chunk for chunk in column.chunks]
     if any(part.null_count for part in parts) or sum(map(len, parts)) != len(column) * size:
         raise CorruptDatasetError(f"expected {size} values in every row, some are missing")
-    # Through DLPack, because Arrow's own to_numpy imports pandas; DLPack has no packed bits.
-    bits = dtype == "bool"
+    bits = dtype == "bool"  # through DLPack, because Arrow's own to_numpy imports pandas; DLPack has no packed bits
     numeric = (pa.types.is_integer, pa.types.is_floating)
     if not all(pa.types.is_boolean(p.type) if bits else any(k(p.type) for k in numeric) for p in parts):
         raise CorruptDatasetError(f"expected {dtype}, got {column.type}")
@@ -188,10 +187,10 @@ def to_numpy(column: pa.ChunkedArray, size: int, dtype: str) -> Array:
 
 
 def open_parquet(path: Path) -> pq.ParquetFile:
-    """Open the parquet file at `path`, which is closed by `with`."""
+    """Open the parquet file at `path`, which is closed by `with`; altered pages that have a sum raise when read."""
     if path.exists() and not path.is_file():
         raise OSError("it is a folder, a device or a pipe, expected a file")
-    file = pq.ParquetFile(path)
+    file = pq.ParquetFile(path, page_checksum_verification=True)
     listed = file.schema_arrow.names
     if doubled := sorted({name for name in listed if listed.count(name) > 1}):
         file.close()
@@ -243,7 +242,8 @@ class RotatingWriter:
         """Start the first file; `pattern` names the files, `encodings` those of their columns, `packing` of pages."""
         self._number = 0  # of the file
         self._root, self._pattern, self._schema = root, pattern, schema
-        self._encodings, self._packing = encodings, packing
+        self._options = {"compression": packing, "use_dictionary": False, "column_encoding": encodings}
+        self._options["write_page_checksum"] = IMAGE in schema.types  # of numbers, each episode has a digest
         self._open()
 
     def _open(self) -> None:
@@ -251,9 +251,7 @@ class RotatingWriter:
         path = self._root / self._pattern.format(chunk_index=chunk, file_index=file)
         path.parent.mkdir(parents=True, exist_ok=True)
         self._file = path.open("wb")
-        self._writer = pq.ParquetWriter(
-            self._file, self._schema, compression=self._packing, use_dictionary=False, column_encoding=self._encodings
-        )
+        self._writer = pq.ParquetWriter(self._file, self._schema, **self._options)
 
     def locate(self) -> tuple[int, int]:
         """Return (chunk_index, file_index) of the next row group, starting a new file if this one is full."""

@@ -225,13 +225,17 @@ def open_recording(root: Path) -> dict[str, Any]:
     if not kept:
         raise BadInputError(f"{root}, recorded by LeRobot, has no episode of two rows or more")
     found = read_cameras(root, info)
+    in_metadata = [(place.length, place.first_row) for _, place in sorted(places.items())]
+    in_data = [(episode.steps + rows.dropped, episode.first_row) for episode in episodes]
+    apart = "" if in_metadata == in_data else "meta/episodes has other lengths or first rows than the data"
+    faults = {name: camera.fault or apart for name, camera in found.items()}
     shown = [(at, episode.steps) for at, episode in enumerate(episodes) if episode.steps]
     cameras = {
         name: Camera(camera.feature, dict(enumerate(camera.clips[at].part(0, steps) for at, steps in shown)))
         for name, camera in found.items()
-        if not camera.fault
+        if not faults[name]
     }
-    more = [f"{name} is left out: {camera.fault}" for name, camera in found.items() if camera.fault]
+    more = [f"{name} is left out: {fault}" for name, fault in faults.items() if fault]
     if others := sorted(info["features"].keys() - {*(spec.name for spec in specs), *names.RESERVED, *found}):
         more.append(f"left out, because they are not lists of numbers: {', '.join(others)}")
     _announce(root, rows, columns, episodes, more)
@@ -310,9 +314,9 @@ def found_in(run: plain.Run, rows: Rows, tasks: Mapping[int, str], *, row: int, 
     lost_success, lost_reward = False, 0.0
     is_terminated = ends_with(names.TERMINATED, run)
     if (success := columns.get(names.SUCCESS)) is not None:
-        facts["success"] = bool(success.any())
         is_over = is_terminated or ends_with(names.DONE, run)
         lost_success = bool(rows.dropped and success[-1] and not success[:-1].any() and not is_over)
+        facts["success"] = bool(success.any()) and not lost_success
     if len(tasks) > 1:
         facts["task"] = tasks.get(int(columns[names.TASK_INDEX][0]), "unknown")
     if names.REWARD in columns and rows.dropped and (len(run) == 1 or not is_terminated):

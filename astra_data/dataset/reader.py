@@ -234,12 +234,15 @@ class Dataset:
             return [str(error)]
 
     def require_whole(self) -> None:
-        """Read every value, for what states something of all of them."""
-        for _ in self.blocks(list(self.features)):
-            pass
+        """Verify, for what states something of all values and pictures; raise CorruptDatasetError at a fault."""
+        with explained(self.root):
+            for fault in self.verify():
+                raise CorruptDatasetError(fault)
 
     def to_huggingface(self) -> "datasets.Dataset":
         """Return the rows as a `datasets.Dataset` in memory, once all values are verified."""
+        if self.recorded is not None:
+            raise BadInputError(f"{self.root} holds other rows: first `astra-data subset {self.root} --percent 100`")
         self.require_whole()
         table = pa.concat_tables(map(pq.read_table, plain.data_files(self.root)))
         rows: datasets.Dataset = optional("datasets").Dataset(table)

@@ -5,7 +5,7 @@ Datasets without a folder of their own live at home, which is $ASTRA_DATA_HOME, 
 <home>/<name>/data-<version>/
 
 A version never changes. Of MAJOR.MINOR.PATCH, a change of the columns increments the first number, one of the
-episodes the second, one of the description alone the third.
+episodes the second; the third stays 0.
 """
 
 import logging

@@ -405,7 +405,7 @@ class StagedWriter:
         self.staged[place], self.lengths[place] = episode.metadata, len(episode)
 
     def drop(self, position: int) -> None:
-        """Leave out the staged episode at `position`; its uid stays taken."""
+        """Leave out the staged episode at `position`."""
         with durable.writing(self._path(position)):
             self._path(position).unlink()
         del self.staged[position], self.lengths[position]

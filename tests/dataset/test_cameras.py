@@ -161,20 +161,28 @@ def test_frames_are_cut_within_groups_and_encoded_again_in_long_ones(codec: str,
     assert any(spans[1].from_s == pytest.approx(key) for key in keys)
 
 
-def test_an_altered_video_is_refused_and_costs_its_episode_alone(source: Dataset, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("folder", "camera", "told"),
+    [("videos", FRONT, "was altered after it was written"), ("data", TOP, "cannot be read (could not verify page")],
+)
+def test_altered_pictures_are_refused_and_cost_their_episode_alone(
+    source: Dataset, tmp_path: Path, folder: str, camera: str, told: str
+) -> None:
     root = shutil.copytree(source.root, tmp_path / "damaged")
-    video = min((root / "videos").rglob("*.mp4"))
-    content = bytearray(video.read_bytes())
-    content[len(content) // 2] ^= 255
-    video.write_bytes(content)
-    assert check(root).faults == [f"{FRONT} in episode 0: {video} was altered after it was written"]
-    assert Dataset.open(root).verify() == [f"{video} was altered after it was written"]
-    altered = "was altered after it was written: `astra-data repair DATASET --out "
-    with pytest.raises(CorruptDatasetError, match=altered):
-        subset(Dataset.open(root), percent=100, out=tmp_path / "all")
+    file = min(path for path in (root / folder).rglob("*") if path.is_file())
+    content = bytearray(file.read_bytes())
+    pictures = [found.end() for found in re.finditer(b"IDAT", content)]  # also in statistics, before and after the rows
+    content[pictures[len(pictures) // 2] if camera == TOP else len(content) // 2] ^= 255
+    file.write_bytes(content)
+    [fault], [of_episode], opened = Dataset.open(root).verify(), check(root).faults, Dataset.open(root)
+    assert f"{file.parent.name}/{file.name} {told}" in fault
+    assert of_episode == f"{camera} in episode 0: {fault}"
+    for use in (opened.require_whole, lambda: subset(opened, percent=100, out=tmp_path / "all")):
+        with pytest.raises(CorruptDatasetError, match=re.escape(told)):
+            use()
     assert not (tmp_path / "all").exists()
     notes = repair(root, out=tmp_path / "repaired").notes
-    assert f"left out the episode of uid 3: {video} was altered after it was written" in notes
+    assert f"left out the episode of uid 3: {fault}" in notes
     assert_shows(tmp_path / "repaired", source, {uid: ALL[uid] for uid in (8, 5)})
 
 
@@ -223,7 +231,9 @@ def test_a_picture_that_cannot_be_decoded_is_told(tmp_path: Path) -> None:
     assert "has 1 images of" in str(clip_fault(Clip(tmp_path / "damaged.parquet", TOP, 2, 1, 2)))
 
 
-@pytest.mark.parametrize("fault", ["missing", "expected 3", "1.950 s for 14 frames", "inside the folder"])
+@pytest.mark.parametrize(
+    "fault", ["missing", "expected 3", "1.950 s for 14 frames", "inside the folder", "lengths or first rows"]
+)
 def test_a_recording_whose_camera_cannot_be_found_opens_without_it(
     source: Dataset, tmp_path: Path, caplog: pytest.LogCaptureFixture, fault: str
 ) -> None:
@@ -238,11 +248,13 @@ def test_a_recording_whose_camera_cannot_be_found_opens_without_it(
     elif fault == "expected 3":
         pq.write_table(rows[:2], path)
     else:
-        ends = pa.array([2.0, *rows[f"videos/{FRONT}/to_timestamp"].to_pylist()[1:]])
-        name = f"videos/{FRONT}/to_timestamp"
-        pq.write_table(rows.set_column(rows.schema.get_field_index(name), name, ends), path)
+        name = "dataset_from_index" if "rows" in fault else f"videos/{FRONT}/to_timestamp"
+        changed = pa.array([2, *rows[name].to_pylist()[1:]], rows[name].type)
+        pq.write_table(rows.set_column(rows.schema.get_field_index(name), name, changed), path)
     found = Dataset.open(root)
-    assert list(found.cameras) == ([] if fault == "expected 3" else [TOP]) and len(found) == len(LENGTHS)
+    assert list(found.cameras) == ([] if fault in ("expected 3", "lengths or first rows") else [TOP]) and len(
+        found
+    ) == len(LENGTHS)
     assert re.search(f"{FRONT} is left out: .*{fault}", caplog.text)
 
 

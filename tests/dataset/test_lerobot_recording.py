@@ -84,6 +84,8 @@ def test_what_cannot_be_is_one_line(recorded: Path, tmp_path: Path) -> None:
         Dataset.open(recorded / "merged")
     with pytest.raises(BadInputError, match="recorded by LeRobot: make a dataset of it first"):
         push(recorded / "arm", str(tmp_path / "shared"))
+    with pytest.raises(BadInputError, match=r"arm holds other rows: first `astra-data subset .*arm --percent 100`"):
+        Dataset.open(recorded / "arm").to_huggingface()
     shutil.copytree(recorded / "ant", tmp_path / "old")
     info = tmp_path / "old/meta/info.json"
     info.write_text(json.dumps(json.loads(info.read_text()) | {"codebase_version": "v2.1"}))

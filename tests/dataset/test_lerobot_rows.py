@@ -111,7 +111,8 @@ def test_a_success_of_the_row_that_is_left_out_is_lost_unless_the_episode_is_ove
         ({}, False),
     ):
         rows, run = rows_and_run(dict(more))
-        assert found_in(run, rows, {}, row=0, uid=9).lost_success == lost
+        found = found_in(run, rows, {}, row=0, uid=9)
+        assert found.lost_success == lost == (not found.metadata.get("success", True))
     rows, run = rows_and_run({names.REWARD: np.arange(STEPS, dtype=np.float32)})
     assert found_in(run, rows, {}, row=0, uid=9).lost_reward == STEPS - 1
     rows, run = rows_and_run({names.REWARD: np.ones(STEPS), names.NEXT_STATE: np.ones((STEPS, 2))})
