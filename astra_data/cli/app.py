@@ -48,9 +48,11 @@ def _options(
 ) -> None:
     """Options before any command."""
     try:
-        os.getcwd()
+        names = [*sys.argv, os.getcwd()]
     except FileNotFoundError:
         raise BadInputError("the folder that this shell is in was removed or replaced: cd to it again") from None
+    if unsound := [name for name in names if name.encode(errors="ignore").decode() != name]:
+        raise BadInputError(f"{', '.join(unsound)}: expected names in UTF-8: choose others")
     if logging.lastResort is not None:  # what prints warnings
         logging.lastResort.setFormatter(_InLines())
     if no_fsync:

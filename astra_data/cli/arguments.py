@@ -159,6 +159,6 @@ def of_recipe(
         if given := [f"--{name.replace('_', '-')}" for name, value in own.items() if value is not None]:
             raise BadInputError(f"{stage}: the recipe's [{table or stage}] sets this: leave out {', '.join(given)}")
         run_stage(Path(place), stage, seeds=seeds, jobs=jobs, root=root)
-    elif len(seeds or ()) > 1 or jobs is not None:
-        raise BadInputError(f"{stage}: give at most one --seed and no --jobs (these are for recipes)")
+    elif len(seeds or ()) > 1 or jobs is not None or root != RUNS:
+        raise BadInputError(f"{stage}: give at most one --seed, no --jobs and no --root (these are for recipes)")
     return place.endswith(".toml")

@@ -205,6 +205,10 @@ def find_sources(
                 "key, so that an episode ends with each file"
             )
         sources += found
+    once = dict[tuple[Path, str], int]()
+    for at in sorted(range(len(sources)), key=lambda at: sources[at].path.is_symlink()):  # a file before links to it
+        once.setdefault((sources[at].path.resolve(), member.name if (member := sources[at].member) else ""), at)
+    sources = [sources[at] for at in sorted(once.values())]
     if file_format == "csv" and mapping and mapping.files:
         sources = _joined(sources, mapping.files)
     for source in sources:

@@ -173,7 +173,7 @@ def test_help_names_what_options_take() -> None:
         assert not re.search(r"list\[|<(int|str|float|path)", shown), shown
 
 
-def test_a_folder_that_is_gone_is_told(
+def test_a_folder_that_is_gone_and_names_that_cannot_be_written_are_told(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     gone = tmp_path / "gone"
@@ -184,6 +184,11 @@ def test_a_folder_that_is_gone_is_told(
     with pytest.raises(SystemExit, match="1"):
         cli.main()
     assert capsys.readouterr().err.endswith("this shell is in was removed or replaced: cd to it again\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["astra-data", "log", "w\udcff"])
+    with pytest.raises(SystemExit, match="1"):
+        cli.main()
+    assert capsys.readouterr().err == "error: w\ufffd: expected names in UTF-8: choose others\n"
 
 
 def test_debugging_shows_the_traceback(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

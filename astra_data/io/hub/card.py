@@ -49,13 +49,14 @@ def write_card(dataset: Dataset, out: Path, notes: Notes, *, source: str | None 
     text = render_card(dataset, notes, source=source, figure=figure.name if figure else None)
     if out.exists() and out.read_bytes() != text.encode():
         raise BadInputError(f"{out} exists already and is not this card; delete it or choose another file.")
-    write_file(out, text)
-    if positions is None or figure is None:
-        return [out]
-    from astra_data.reports.figures.style import coverage, png  # noqa: PLC0415 - slow
+    files: dict[Path, str | bytes] = {out: text}
+    if positions is not None and figure is not None:
+        from astra_data.reports.figures.style import coverage, png  # noqa: PLC0415 - slow
 
-    write_file(figure, png(coverage(positions.counts, positions.extent, "position", "m")))
-    return [out, figure]
+        files[figure] = png(coverage(positions.counts, positions.extent, "position", "m"))
+    for path, content in files.items():
+        write_file(path, content)
+    return [*files]
 
 
 def render_card(dataset: Dataset, notes: Notes, *, source: str | None = None, figure: str | None = None) -> str:
@@ -163,16 +164,15 @@ def _provenance(description: dict[str, Any]) -> str:
         ("version", description["version"]),
         ("made by stage", in_markdown(description["stage"])),
         ("from", "; ".join(parents) or "nothing earlier"),
-        *((key, _json(description[key])) for key in ("config", "seeds", "environment", "simulator")),
+        *(
+            (key, in_code(json.dumps(of, ensure_ascii=False)) if (of := description[key]) else "none")
+            for key in ("config", "seeds", "environment", "simulator")
+        ),
         ("packages", in_markdown(", ".join(packages))),
         ("commit", in_code(description["git_commit"]) if description["git_commit"] else "not recorded"),
         ("content hash (sha256)", f"`{description['content_hash']}`"),
     ]
     return _table(("what", "value"), rows)
-
-
-def _json(content: dict[str, Any]) -> str:
-    return in_code(json.dumps(content, ensure_ascii=False)) if content else "none"
 
 
 def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:

@@ -50,6 +50,7 @@ def push(
     from astra_data.io.hub.card import Notes, write_card  # noqa: PLC0415 - draws, unlike pull
 
     place = stores.parse_place(destination)
+    _refuse_folder(place, destination, "push to")
     local = open_dataset(dataset)
     if local.recorded is not None:
         command = f"`astra-data subset {local.root} --percent 100`"
@@ -73,6 +74,11 @@ def push(
             (card / stores.SUMS_PATH).write_text(stores.make_sums(local.root), encoding="utf-8")
             place.upload(local, card, progress)
     return f"{place}@{version.tag}"
+
+
+def _refuse_folder(place: object, given: str, action: str) -> None:
+    if isinstance(place, stores.HubStore) and not given.startswith("hf://") and Path(place.repo).is_dir():
+        raise BadInputError(f"{given} is a folder here: {action} ./{given}, or hf://datasets/{given} of the Hub")
 
 
 def _refuse_change(there: stores.RemoteFolder, local: Dataset) -> None:
@@ -118,8 +124,7 @@ def pull(
     asked = Version.parse(version.removeprefix("data-")) if version else named
     if named and asked != named:
         raise BadInputError(f"{source} names {named.tag}, but the version asked for is {version}.")
-    if isinstance(place, stores.HubStore) and not source.startswith("hf://") and Path(place.repo).is_dir():
-        raise BadInputError(f"{source} is a folder here: pull ./{source}, or hf://datasets/{source} of the Hub")
+    _refuse_folder(place, source, "pull")
     known = place.versions()
     if not known:
         names = place.names()[:MOST_NAMED] if isinstance(place, stores.UrlStore) else []

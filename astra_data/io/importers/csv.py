@@ -43,7 +43,7 @@ def whole_lines(source: Source) -> tuple[bytes, bool]:
     """
     with source.open() as stream:
         content = stream.read()
-    header = re.match(rb"(?:\r?\n)*(.*)", content)[1].rstrip(b"\r")  # type: ignore[index]
+    header = re.match(rb"[\r\n]*([^\r\n]*)", content)[1]  # type: ignore[index]
     if header.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         raise BadInputError(f"{source}: expected text in UTF-8, got UTF-16: {_SAVE}")
     delimiter, first = delimiter_of(source), header.decode()

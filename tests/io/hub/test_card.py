@@ -1,4 +1,5 @@
 import re
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -63,6 +64,13 @@ def test_sums_are_folded_away(fake: Dataset) -> None:
     assert fake.content_hash in folded and fake.content_hash not in shown + after
     # A table inside of HTML is read as one only after an empty line.
     assert "</summary>\n\n| what | value |" in folded and folded.endswith("|\n\n")
+
+
+def test_without_its_figure_no_card_is_written(fake: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "astra_data.reports.figures.style", None)
+    with pytest.raises(ModuleNotFoundError, match="style"):
+        write_card(fake, tmp_path / "it.md", Notes())
+    assert [*tmp_path.iterdir()] == []
 
 
 def test_without_positions_there_is_no_figure(tmp_path: Path) -> None:

@@ -60,13 +60,15 @@ def test_killed_at_any_moment_a_pull_leaves_nothing_unreadable(fake: Dataset, sh
 
 
 def test_a_folder_here_is_not_looked_for_on_the_hub(
-    shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    fake: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine/fake").mkdir(parents=True)
     for source in ("mine/fake", "mine/fake@data-1.0.0"):
         with pytest.raises(BadInputError, match=rf"^{source} is a folder here: pull ./{source}, or hf://"):
             pull(source)
+    with pytest.raises(BadInputError, match=r"^mine/fake is a folder here: push to \./mine/fake, or hf://"):
+        push(fake.root, "mine/fake")
 
 
 def test_what_is_there_already_is_left_alone(fake: Dataset, shared: Path, tmp_path: Path) -> None:

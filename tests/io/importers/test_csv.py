@@ -15,8 +15,7 @@ STAMPED = MAPPING.replace('fields = ["gait"]', 'fields = ["stamp"]')
 
 
 def test_csv_whose_later_blocks_look_different(tmp_path: Path) -> None:
-    # Two blocks of 1 MB: whole numbers and labels that look like numbers first, then others.
-    n = 60_000
+    n = 60_000  # two blocks of 1 MB: whole numbers and labels that look like numbers first, then others
     lines = [f"{i},1,0,0,0,1,2,{'0' * 20}\n" for i in range(n)]
     lines += [f"{i}.5,,0.5,0,0,1,b,zzz\n" for i in range(n)]
     path = tmp_path / "log.csv"
@@ -93,7 +92,7 @@ TORN = (
 )
 
 
-@pytest.mark.parametrize("end", ["\n", "\r\n"])
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
 def test_a_last_line_that_is_cut_off_is_rejected_alone(tmp_path: Path, end: str) -> None:
     """In a file, and in an archive."""
     rows = 3
@@ -111,6 +110,8 @@ def test_a_last_line_that_is_cut_off_is_rejected_alone(tmp_path: Path, end: str)
             assert (tally.rows, tally.rejected_rows, tally.torn_rows) == (rows + 1, 1, 1)
             assert tally.torn_first.endswith(f"log.csv line {rows + 2}")
         assert "rejected rows: 1; cut off at the end of their files: 1, the first is " in str(report)
+    log.write_bytes(whole.removesuffix(end).encode())
+    assert imported(tmp_path / "whole", log, TORN)[1].tally.rejected_rows == 0
 
 
 def test_a_cut_off_line_begins_a_new_episode_where_files_go_on(tmp_path: Path) -> None:
