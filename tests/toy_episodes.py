@@ -45,7 +45,6 @@ def toy_episodes(
     )
     return PairedEpisodes(
         target_state=torch.zeros(*state.shape[:2], 29) if target_state is None else target_state,
-        reward=paid,
         terminated=ended,
         windows=windows,
         reference="toy@data-1.0.0",

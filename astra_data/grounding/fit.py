@@ -128,12 +128,13 @@ class HistoryFit:
             latent_size=config.latent_size,
             position_octaves=_POSITION_OCTAVES if fitting.task.plane else 0,
             ball_index=fitting.task.ball_index,
+            ball_rolls=fitting.task.ball_rolls,
             corrects_reward=corrects_reward,
             encoder=(self.encoder or HistoryEncoder).kind,
         )
         model = GroundingModel(shape).to(fitting.device)
         if self.encoder:
-            first = windows.state[:2, :5], windows.goal[:2, :5], windows.previous_action[:2, :5]
+            first = [each[:2, : config.window] for each in (windows.state, windows.goal, windows.previous_action)]
             check_encoder(model.encoder, model.encoder_input(*first))
         correction = windows.next_state - windows.simulated_next
         columns = {"state": windows.state, "goal": windows.goal, "correction": correction}

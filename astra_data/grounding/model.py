@@ -37,14 +37,10 @@ class GroundingShape:
     head_sizes: tuple[int, ...] = (128, 128)
     position_octaves: int = 4  # of `PositionFeatures`; 0 for none, as in states without a position
     ball_index: int | None = None  # in the state, where the position of a ball begins; None where there is none
+    ball_rolls: bool = False  # its velocity follows, and ends the state
     corrects_reward: bool = True  # R_pred predicts the residual reward, the target's less the task's own, as well
     log_variance_bounds: tuple[float, float] = (-6.0, 2.0)
     encoder: str = HistoryEncoder.kind  # see `ENCODERS`
-
-    @property
-    def ball_rolls(self) -> bool:
-        """Whether states end with a ball's position and velocity."""
-        return self.ball_index is not None and self.ball_index + 4 == self.state_size
 
     @property
     def lying_ball(self) -> slice | None:

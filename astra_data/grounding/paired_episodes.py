@@ -74,7 +74,6 @@ class PairedEpisodes:
     """E paired episodes, or pieces of those far longer than most, padded at the end to T steps."""
 
     target_state: Tensor  # s_i, or the inputs in its place, (E, T, S)
-    reward: Tensor  # the target's, r_i, (E, T)
     terminated: Tensor  # (E, T) bool, the task ended there, in success or failure; not set by time-outs
     windows: PairedWindows  # everything else, (E, T, ...), with the mask of real steps
     reference: str  # name and version of the dataset
@@ -133,7 +132,6 @@ class PairedEpisodes:
         failed = terminated & ~padded.get(names.SUCCESS, terminated)
         return cls(
             target_state=torch.cat([padded[name] for name in inputs or (names.STATE,)], dim=-1).float(),
-            reward=reward,
             terminated=terminated,
             windows=PairedWindows(
                 state=padded[names.ABSTRACT_STATE],
@@ -188,7 +186,7 @@ class PairedEpisodes:
 
     def select(self, episodes: Tensor) -> "PairedEpisodes":
         """Return the episodes `episodes` (n,)."""
-        columns = ("target_state", "reward", "terminated", "uids", "recordings", "held_out")
+        columns = ("target_state", "terminated", "uids", "recordings", "held_out")
         given = {name: values[episodes] for name in columns if (values := getattr(self, name)) is not None}
         return replace(self, windows=_gather(self.windows, episodes), **given)
 

@@ -21,7 +21,7 @@ from astra_data.grounding.descent import refuse_divergence, seed_generators
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.methods.method import Method, Table
 from astra_data.policies.running_policy import PolicyFile
-from astra_data.policies.simulator_env import Recorded, policy_observation
+from astra_data.policies.simulator_env import Recorded, policy_observation, without_padding
 from astra_data.policies.train import Training
 from astra_data.worlds.task import Task
 
@@ -280,15 +280,16 @@ def experience_of(task: Task, episodes: PairedEpisodes) -> Experience:
     windows = episodes.windows
     features = _position_features(task).to(windows.state.device)
     now, later = (
-        torch.cat([policy_observation(task.objective, state, windows.goal, None), features(state[..., :2])], dim=-1)
+        torch.cat([without_padding(seen, windows.mask), features(state[..., :2])], dim=-1)
         for state in (windows.state, windows.next_state)
+        for seen in [policy_observation(task.objective, state, windows.goal, None)]
     )
     return Experience(
         observation=now,
         previous_action=windows.previous_action,
         action=windows.action,
         lengths=episodes.lengths,
-        reward=episodes.reward,
+        reward=windows.reward,
         next_observation=later,
         terminated=episodes.terminated,
     )

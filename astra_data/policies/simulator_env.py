@@ -56,6 +56,11 @@ def policy_observation(objective: Objective, state: Tensor, goal: Tensor, latent
     return seen if latent is None else torch.cat([latent / latent.shape[-1] ** 0.5, seen], dim=-1)
 
 
+def without_padding(seen: Tensor, mask: Tensor) -> Tensor:
+    """Return what was made (E, T, ...) of padded steps with 0 where the padding, by its mask (E, T), made no number."""
+    return torch.where(mask.bool().unsqueeze(-1) | seen.isfinite(), seen, 0.0)
+
+
 @dataclass(frozen=True)
 class Recorded:
     """E recorded episodes of up to T steps as a policy sees them, padded."""
@@ -86,7 +91,7 @@ def recorded_steps(task: Task, episodes: PairedEpisodes, grounding: Grounding) -
     if (source := grounding.encoder) is not None:
         inputs = source.encoder_input(windows.state, windows.goal, windows.previous_action)
         latent, _ = source.encoder.sequence(inputs)
-    seen = policy_observation(task.objective, windows.state, windows.goal, latent)
+    seen = without_padding(policy_observation(task.objective, windows.state, windows.goal, latent), windows.mask)
     return Recorded(seen, windows.previous_action, windows.action, episodes.lengths)
 
 
@@ -117,7 +122,8 @@ class SimulatorEnv:
         self._shows_parameters = shows_parameters
         shown = simulator.parameters if shows_parameters else None
         self.parameter_count = 0 if shown is None else shown.shape[1]
-        self.observation_size = self._observe().shape[1]
+        seen = policy_observation(objective, simulator.state, self.goal, simulator.latent)  # maybe of no episode's
+        self.observation_size = seen.shape[1] + self.parameter_count
 
     def reset(self, mask: Tensor | None = None) -> Tensor:
         """Reset the rows in `mask` (B,), by default all; return observations (B, O)."""

@@ -192,8 +192,7 @@ def optimize(learner: Learner, env: TrainingEnv, training: Training, checkpoint:
         # JSON has no NaN: undefined figures, such as the success rate of no episodes, are null.
         known = {name: None if math.isnan(value) else value for name, value in metrics.items()}
         if is_lasting:
-            # Success is to last to the horizon, which is not an end here: all ends are failures.
-            known["success"] = None
+            known["success"] = None  # it is to last to the horizon, which is not an end here: all ends are failures
         points.append({"steps": learner.steps, "share": learner.share, **known})
         rate = learner.steps / stopwatch.seconds
         note = f"{rate:,.0f} steps/s  {lately(points, 'episode_steps' if is_lasting else 'success')}"
@@ -259,7 +258,7 @@ def with_restarts(learn: Learn, training: Training, grounding_file: Path | None)
         made.append((reached_in_own_world(training.task, saved, grounding, training.seed), policy, curve))
         if made[-1][0].success >= config.least_success:
             break
-    _, policy, curve = max(made, key=lambda one: (one[0].success >= config.least_success, one[0].success))
+    _, policy, curve = max(made, key=lambda one: one[0].success)
     tries = [
         {"seed": seed, "success": one.success, "episode_steps": one.steps, "points": of_try["points"]}
         for seed, (one, _, of_try) in zip(seeds, made, strict=False)

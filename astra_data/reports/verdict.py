@@ -71,7 +71,11 @@ def verdict_of(results: Results) -> Verdict:
     chosen, advice = None, "Deploy" if in_target else "Try first"
     first = floor if floor and is_beaten else best
     failed = results.summary(first, "failed") if in_target and limit is not None else None
-    if worth[first].value < least:
+    tried = None if in_target else results.trials
+    if tried and tried.choice and tried.rate and tried.percent in (None, results.largest):
+        chosen = tried.chosen[0] if tried.chosen and tried.rate[0] >= ENOUGH else None
+        text = f"{'Deploy' if chosen else 'Deploy none yet; best in trials is'} {tried.choice}."
+    elif worth[first].value < least:
         text = "{} did not learn its own simulator ({})"
         why = [text.format(method_title(row), results.headline.text(found)) for row, found in poor.items()]
         if not why:

@@ -53,13 +53,13 @@ class Commands(dict[str, tuple[float, float]]):
             raise BadInputError(f"commands: {', '.join(still)} never changes in {source.reference}: give the bounds")
         return cls(dict(zip(names, ends, strict=True)))
 
-    def in_units(self, action: Tensor) -> Tensor:
-        """Return actions of ±1 (..., A), clipped to that first, in the units of the commands."""
-        clipped = action.clamp(-1.0, 1.0)
+    def in_units(self, action: Tensor, *, is_recorded: bool = False) -> Tensor:
+        """Return actions of ±1 (..., A) in the units of the commands: clipped first, unless they were recorded."""
+        given = action if is_recorded else action.clamp(-1.0, 1.0)
         if self.are_normal:
-            return clipped
+            return given
         middle, half = map(torch.from_numpy, (self._middle, self._half))
-        return middle.to(action.device) + half.to(action.device) * clipped
+        return middle.to(action.device) + half.to(action.device) * given
 
     def normal(self, command: Tensor) -> Tensor:
         """Return commands (..., A) as multiples of ±1; those beyond the bounds are beyond ±1."""
@@ -106,8 +106,8 @@ class DrivenSimulator:
         self.simulator.reset_to(state.to(self._there), None if rows is None else rows.to(self._there))
 
     def step(self, action: Tensor) -> Tensor:
-        """Apply `action` (B, A) of ±1; return the new states (B, X)."""
-        landed = self.simulator.step(self._commands.in_units(action).to(self._there))
+        """Apply `action` (B, A) of ±1, of recorded commands maybe beyond; return the new states (B, X)."""
+        landed = self.simulator.step(self._commands.in_units(action, is_recorded=True).to(self._there))
         return landed.to(self._device, copy=True)
 
     def settle(self, before: Tensor, landed: Tensor) -> Tensor:

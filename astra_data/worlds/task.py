@@ -247,7 +247,8 @@ class Task:
         abstract_state: the column of abstract states, by default the simulator's.
         beyond: what φ drops, scaled to about 1, (..., S) to (..., R); by default the whole state.
         quantities: indices in abstract states of what the gap report lists, by name with unit; by default each.
-            `ball_position_m`, x and y, is of what the robot kicks or pushes: corrections see how far it is.
+            `ball_position_m`, x and y, is of what the robot, whose x and y come first, kicks or pushes: corrections
+            see how far it is; `ball_velocity_m_s`, if it ends the state, how it rolls.
         facts: what datasets record about the target environment.
         simulator_id: names the abstract simulator in datasets, by default after its class.
         varied: the same simulator with parameters that vary, by default what reaches it of the commands.
@@ -325,8 +326,10 @@ class Task:
             expected = "expected above 0 and below 2 s, since datasets have a whole number of steps per second"
             faults.append(f"timestep_s: {expected}: got {self.timestep_s}")
         ball = (self.quantities or {}).get(_BALL)
-        if ball is not None and (not ball or ball[0] < 0 or [*ball] != [ball[0], ball[0] + 1]):
-            faults.append(f"quantities: {_BALL}: expected two indices in a row, of x and y, got {ball}")
+        if ball is not None and (not ball or ball[0] < 2 or [*ball] != [ball[0], ball[0] + 1]):
+            faults.append(
+                f"quantities: {_BALL}: expected two indices in a row, of x and y, after the robot's, got {ball}"
+            )
         if not NAME.fullmatch(self.name):
             faults.append("name: expected letters, digits, '.', '_' and '-', since datasets are named after it")
         if faults:
@@ -381,9 +384,15 @@ class Task:
 
     @property
     def ball_index(self) -> int | None:
-        """Index in abstract states of the ball's x; None where there is no ball."""
+        """Index in abstract states, after the robot's x and y, of the ball's x; None where there is no ball."""
         ball = self.quantities.get(_BALL, ())
-        return ball[0] if len(ball) == 2 else None
+        return ball[0] if len(ball) == 2 and ball[0] >= 2 else None
+
+    @property
+    def ball_rolls(self) -> bool:
+        """Whether abstract states end with the ball's position and velocity."""
+        moves = self.quantities.get("ball_velocity_m_s")
+        return moves is not None and self.ball_index == moves[0] - 2 == self.abstract_state.size - 4
 
     @property
     def fps(self) -> int:

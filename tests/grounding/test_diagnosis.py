@@ -142,8 +142,7 @@ def test_a_command_that_the_simulator_ignores_is_named(tmp_path: Path) -> None:
     found = recorded(tmp_path, deaf=True)
     [line] = [line for line in found.findings if line.what == "push has no effect in the simulator"]
     assert line.severity == "note" and not found.responses[1].weights.any()
-    # Where it only rounds, there is no place where it errs more.
-    x, y = found.missed
+    x, y = found.missed  # where it only rounds, there is no place where it errs more
     assert next(iter(found.explained.values()))[0] > 0.99
     assert x.error < 1e-6 and not x.where and y.error == pytest.approx(0.1 * 0.5 / np.sqrt(3), rel=0.1)
 

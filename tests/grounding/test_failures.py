@@ -179,8 +179,7 @@ def test_the_likelihood_is_that_of_the_moments_over_a_constant_rate(monkeypatch:
     expected = np.log(np.where(now, hazard, 1 - hazard)).sum() - np.log(np.where(now, rate, 1 - rate)).sum()
     assert found is not None and found[0] == pytest.approx(expected / 6, abs=1e-3) and found[0] > 0.1
     assert [float(one) for one in found[1:]] == pytest.approx([np.exp(scale), shift], abs=1e-2)
-    # Whoever predicts a fold has not seen it.
-    counts = [int(episodes.windows.mask[~fold].sum()) for fold in divided]
+    counts = [int(episodes.windows.mask[~fold].sum()) for fold in divided]  # whoever predicts a fold has not seen it
     assert [len(one) for one in fitted] == counts and len(counts) == 5
 
 

@@ -93,8 +93,7 @@ def test_each_step_is_corrected_given_the_latent_of_the_history_before_it() -> N
         corrected = used.correct(used.encoder.latent(hidden), action, landed)
         assert (corrected - landed).abs().max() > 1e-3
         before, state, previous = state, one.step(action), action
-        # Nothing is near a wall: the state is where the correction put it.
-        torch.testing.assert_close(state, corrected)
+        torch.testing.assert_close(state, corrected)  # nothing is near a wall: the state is where the correction put it
         assert torch.equal(one.state, state) and not torch.equal(state, before)
 
 
@@ -187,8 +186,7 @@ def test_a_start_draws_the_parameters_of_its_rows_anew() -> None:
     names = TASK.varied.wide.names
     drawn = [names.index(name) for name in ("friction", "heading_bias_deg", "timestep_scale")]
     assert (after[2, drawn] != before[2, drawn]).all() and torch.equal(after[[0, 1, 3]], before[[0, 1, 3]])
-    # From -1 at the lower to 1 at the upper end.
-    friction = after[:, names.index("friction")]
+    friction = after[:, names.index("friction")]  # from -1 at the lower to 1 at the upper end
     low, high = TASK.varied.wide.friction  # type: ignore[attr-defined]
     inner = one.simulator.parameters[:, names.index("friction")]  # type: ignore[index]
     torch.testing.assert_close(friction, (inner - low) / (high - low) * 2 - 1, atol=1e-5, rtol=0)

@@ -24,7 +24,7 @@ def _all_is_fitted_briefly(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def ball_model() -> GroundingModel:
     torch.manual_seed(0)
-    return GroundingModel(GroundingShape(8, 3, 2, latent_size=8, position_octaves=0, ball_index=4))
+    return GroundingModel(GroundingShape(8, 3, 2, latent_size=8, position_octaves=0, ball_index=4, ball_rolls=True))
 
 
 def kicks(seed: int = 0) -> PairedEpisodes:
@@ -78,7 +78,7 @@ def test_without_a_rolling_ball_there_is_nothing_to_fit() -> None:
     before = {name: values.clone() for name, values in model.state_dict().items()}
     fit_hits(model, training, seed=0)
     assert all(values.equal(before[name]) for name, values in model.state_dict().items())
-    assert GroundingModel(GroundingShape(6, 3, 2, ball_index=2)).hits is not None
+    assert GroundingModel(GroundingShape(6, 3, 2, ball_index=2, ball_rolls=True)).hits is not None
     assert GroundingModel(GroundingShape(8, 3, 2, ball_index=2)).hits is None
 
 

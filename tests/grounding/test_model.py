@@ -214,8 +214,7 @@ def test_a_correction_is_added_in_the_units_of_the_data() -> None:
     beside = GroundingModel(GroundingShape(6, 2, 2, latent_size=8, position_octaves=0, ball_index=4))
     beside.state_mean.fill_(1.0)
     near = beside.state_features(torch.tensor([1.0, 2.0, 0.0, 0.0, 1.03, 1.96])).tolist()
-    # Of the ball, in 0.1 m.
-    assert near == pytest.approx([0.0, 1.0, -1.0, -1.0, 0.03, 0.96, 0.3, -0.4, 0.5], abs=1e-4)
+    assert near == pytest.approx([0.0, 1.0, -1.0, -1.0, 0.03, 0.96, 0.3, -0.4, 0.5], abs=1e-4)  # of the ball, in 0.1 m
 
 
 def test_the_loss_of_the_correction_is_its_squared_error_in_units_of_the_data() -> None:

@@ -58,8 +58,7 @@ def test_a_perfect_simulator_has_no_gap() -> None:
 def test_a_constant_correction_closes_a_constant_gap() -> None:
     grounding = untrained()
     slow = episodes(speed=0.5)
-    # The same command throughout, so that one number corrects each step.
-    one = slow.select(torch.tensor([0]))
+    one = slow.select(torch.tensor([0]))  # the same command throughout, so that one number corrects each step
     error = (one.windows.next_state - one.windows.simulated_next)[0]
     assert error.std(0).max() < 1e-4
     with torch.no_grad():
@@ -109,8 +108,7 @@ def test_intervals_are_percentiles_of_means_over_resampled_episodes() -> None:
     assert again == pytest.approx((mean, low, high))
     absent = _interval(errors, 2 * episode, np.random.default_rng(0))
     assert absent == pytest.approx((mean, low, high))  # each second is absent
-    # Longer episodes have more weight.
-    episode = torch.arange(6).repeat_interleave(torch.arange(1, 7))
+    episode = torch.arange(6).repeat_interleave(torch.arange(1, 7))  # longer episodes have more weight
     drawn = np.random.default_rng(1).choice(np.arange(6), (1000, 6))
     of = [errors[:21][episode == number].numpy() for number in range(6)]
     means = [np.concatenate([of[number] for number in row]).mean() for row in drawn]

@@ -71,8 +71,8 @@ def test_a_next_state_that_was_made_up_is_no_step(tmp_path: Path) -> None:
     # The third and the fourth episode, which are terminated, lose their last step; the one of a step is kept.
     assert episodes.lengths.tolist() == [7, 1, 12, 30, 5] and merged.lengths.tolist() == [7, 1, 11, 29, 5]
     assert merged.terminated.nonzero().tolist() == [[2, 10], [3, 28]]
-    assert merged.reward[2, :11].tolist() == [*(-label(2, step) for step in range(10)), -621.0]
-    assert torch.equal(merged.windows.reward, merged.reward) and merged.reward[3, 28] == -label(3, 28) - label(3, 29)
+    assert merged.windows.reward[2, :11].tolist() == [*(-label(2, step) for step in range(10)), -621.0]
+    assert merged.windows.reward[3, 28] == -label(3, 28) - label(3, 29)
     assert merged.windows.next_state[3, 28, 0] == label(3, 28)
     assert merged.windows.failed.nonzero().tolist() == [[3, 28]]  # the third still succeeds
     assert merged.held_out is not None and merged.held_out.tolist() == [False, True, False, True, False]
@@ -85,7 +85,7 @@ def test_where_no_step_is_one_of_the_robot_there_is_nothing_to_load(
     monkeypatch.setitem(globals(), "LENGTHS", (1, 1, 1, 1))
     whole = write(tmp_path / "pairs", SIZES | {keys.NEXT_STATE: 3}, made_up=True)
     left = PairedEpisodes.load(whole)
-    assert left.lengths.tolist() == [1, 1] and left.reward.tolist() == [[-label(0, 0)], [-label(1, 0)]]
+    assert left.lengths.tolist() == [1, 1] and left.windows.reward.tolist() == [[-label(0, 0)], [-label(1, 0)]]
     ended = filter_episodes(Dataset.open(whole), without=[0, 1], out=tmp_path / "ended")
     with pytest.raises(BadInputError, match="no step is left: each episode has one, whose"):
         PairedEpisodes.load(ended)
@@ -119,7 +119,7 @@ def test_rewards_are_as_recorded_and_what_ends_an_episode_is_marked(episodes: Pa
         assert torch.equal(windows.reward[episode, :length], expected)
         goes_on = [1.0] * (length - 1) + [0.0 if episode in (2, 3) else 1.0]
         assert windows.goes_on[episode].tolist() == goes_on + [0.0] * (30 - length)
-    assert torch.equal(windows.reward, episodes.reward) and windows.failed.nonzero().tolist() == [[3, 29]]
+    assert windows.failed.nonzero().tolist() == [[3, 29]]
 
 
 def test_only_the_last_second_before_a_bad_end_fails_soon(episodes: PairedEpisodes) -> None:
@@ -189,8 +189,7 @@ def test_windows_hold_every_step_equally_often(episodes: PairedEpisodes, length:
     labels = windows.state[..., 0]
     within = labels > 0
     assert within[windows.mask.bool()].all()
-    # One episode each, and steps in order.
-    number, step = (labels / 100).floor(), labels % 100
+    number, step = (labels / 100).floor(), labels % 100  # one episode each, and steps in order
     assert ((number == number[:, :1]) | ~within).all()
     assert ((step - step[:, :1] == torch.arange(length)) | ~within).all()
     seen, times = labels[windows.mask.bool()].unique(return_counts=True)

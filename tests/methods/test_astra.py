@@ -3,8 +3,7 @@ from astra_data.methods import METHODS
 from astra_data.policies.train import InSimulator
 
 ROWS = {
-    # whether it aligns; what pays; what its fit leaves out or adds
-    "astra": (True, "predicted", {}),
+    "astra": (True, "predicted", {}),  # whether it aligns; what pays; what its fit leaves out or adds
     "astra_without_latent": (False, "predicted", {"latent": False}),
     "astra_without_reward": (True, "abstract", {"reward": False}),
     "astra_task_reward": (True, "abstract", {}),

@@ -1,6 +1,5 @@
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +34,7 @@ def episodes() -> PairedEpisodes:
     mask, terminated = torch.ones(6, STEPS), torch.zeros(6, STEPS, dtype=torch.bool)
     mask[5, 20:] = 0.0
     terminated[5, 19] = True
-    made = toy_episodes(
+    return toy_episodes(
         state[:, :-1],
         action,
         next_state=state[:, 1:],
@@ -46,7 +45,6 @@ def episodes() -> PairedEpisodes:
         terminated=terminated,
         target_state=torch.randn(6, STEPS, 29),
     )
-    return replace(made, windows=replace(made.windows, reward=torch.full((6, STEPS), torch.nan)))
 
 
 @pytest.fixture
@@ -116,7 +114,7 @@ def test_cloning_does_what_was_recorded_whatever_it_paid(
     # Going right pays, going left does not; both were recorded, left three times as often.
     rightwards = torch.rand(6, STEPS) < 0.25
     episodes.windows.action.copy_(torch.where(rightwards, 0.8, -0.8).unsqueeze(-1).expand(-1, -1, 2))
-    episodes.reward.copy_(torch.where(rightwards, 10.0, -10.0))
+    episodes.windows.reward.copy_(torch.where(rightwards, 10.0, -10.0))
     settings: dict[str, Any] = {"critic_updates": 100, "return_steps": 1, "policy_updates": 150}
     settings |= {"learning_rate": 1e-2}
     seen = experience_of(TASK, episodes)

@@ -13,8 +13,7 @@ def test_settings_are_read_from_one_table_by_the_stage_that_takes_them() -> None
         "behavior_cloning": ("iql", "train"),
         "direct_transfer_iql": ("iql", "train"),
     }
-    # Recorded settings are compared as text as well: the order stays.
-    assert list(tables()) == ["rma", "target", "iql"]
+    assert list(tables()) == ["rma", "target", "iql"]  # recorded settings are compared as text as well: the order stays
     for method in METHODS.values():
         assert method.table is None or tables()[method.table.name] == method.table
 

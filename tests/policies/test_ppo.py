@@ -164,8 +164,7 @@ def test_a_training_that_diverges_says_so() -> None:
 def test_a_single_step_has_no_advantage_over_others() -> None:
     with pytest.raises(BadInputError, match="rollout_steps: expected 2 or more in a single environment, got 1"):
         ppo(GoToZero(1), 2, horizon=5, rollout_steps=1)
-    # Fewer environments than minibatches are enough.
-    train(ppo(GoToZero(1), 1, horizon=5, rollout_steps=2))
+    train(ppo(GoToZero(1), 1, horizon=5, rollout_steps=2))  # fewer environments than minibatches are enough
     train(ppo(GoToZero(2), 1, horizon=5, rollout_steps=1))
 
 

@@ -11,6 +11,7 @@ from astra_data.grounding.history import GroundedSimulator, HistoryGrounding
 from astra_data.grounding.model import GroundingModel, GroundingShape
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.simulator import NO_GROUNDING, EpisodeSimulator, Grounding
+from astra_data.methods.iql import experience_of
 from astra_data.policies import simulator_env
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.objective import NO_LIMIT
@@ -76,6 +77,7 @@ def test_what_is_not_finite_is_told_with_its_state(function: str, told: str, mon
     monkeypatch.setattr(Navigation, function, sometimes)
     with pytest.raises(BadInputError) as caught:
         env.step(torch.zeros(4, 2))
+    assert world().observation_size == env.observation_size  # of states that no episode begins with
     where = f"state {env.simulator.state[2].tolist()} and the goal {env.goal[2].tolist()}"
     assert str(caught.value) == f"{told}: expected finite numbers, got -inf for the abstract {where}"
 
@@ -144,7 +146,7 @@ def test_a_predicted_reward_is_the_tasks_own_corrected_and_what_the_risk_costs()
 def test_predicted_rewards_leave_to_the_task_what_the_simulated_state_shows() -> None:
     torch.manual_seed(0)
     task = TASKS["nao-kick"]
-    model = GroundingModel(GroundingShape(8, 3, 2, latent_size=8, ball_index=4, corrects_reward=False))
+    model = GroundingModel(GroundingShape(8, 3, 2, latent_size=8, ball_index=4, ball_rolls=True, corrects_reward=False))
     one = simulator_env.SimulatorEnv(task.objective, HistoryGrounding(model).corrected(task.simulator(3)), PREDICTED)
     # Balls that roll on in the field, into the goal, and over the side line.
     balls = torch.tensor([[0.0, 0.0, 0.5, 0.0], [1.4, 0.0, 1.0, 0.0], [0.0, 1.9, 0.0, 1.0]])
@@ -251,6 +253,17 @@ def test_without_settings_it_is_the_plain_simulator(episodes: PairedEpisodes, gr
         drawn = torch.get_rng_state()
         world.step(torch.zeros(4, 2))
         assert torch.equal(torch.get_rng_state(), drawn)
+
+
+def test_what_observe_makes_of_padding_is_not_seen(episodes: PairedEpisodes, monkeypatch: pytest.MonkeyPatch) -> None:
+    of, mask = episodes.windows, episodes.windows.mask.unsqueeze(-1)
+    state = (of.state * mask).index_fill(1, torch.tensor([0]), 0.0)  # and of a real step there is none
+    given = replace(episodes, windows=replace(of, state=state, next_state=of.next_state * mask))
+    monkeypatch.setattr(Navigation, "observe", lambda self, state, goal: state / state.norm(dim=-1, keepdim=True))
+    learned = experience_of(TASK, given)
+    assert learned.next_observation.isfinite().all()
+    for seen in (simulator_env.recorded_steps(TASK, given, NO_GROUNDING).observation, learned.observation):
+        assert seen[:, 1:].isfinite().all() and seen[:, 0, :4].isnan().all()
 
 
 @pytest.mark.parametrize(("reward", "prices"), [("abstract", False), ("predicted", True), ("priced", True)])

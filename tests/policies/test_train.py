@@ -108,8 +108,7 @@ WALKER = TASKS["humanoid-kinematics"]
         # Mastered from the first point on: penalties grow over a quarter, and then it is six times as fast.
         (TASK, True, 1.0, [0.0, 0.4, 0.8, 1.0, 1.0]),
         (TASK, False, 1.0, [1.0] * 3),
-        # The recipe asks for 0.7.
-        (TASK, True, 0.71, [0.0] * 4 + [0.4, 0.8] + [1.0] * 4),
+        (TASK, True, 0.71, [0.0] * 4 + [0.4, 0.8] + [1.0] * 4),  # the recipe asks for 0.7
         (TASK, True, 0.69, [0.0] * 10),
         (TASK, False, 0.9, [1.0] * 10),
         # Success that is to last is unknown here: nothing grows, and nothing ends early.

@@ -59,8 +59,7 @@ def test_the_way_is_that_of_the_robot_in_episodes_that_succeed(path: Path) -> No
     robot[1] = [[0, 0], [0, 1], [0, 2], [0, 3]]
     robot[2] = 100 * robot[1]
     tensors = path.with_name("some.safetensors")
-    # Whatever its ball does.
-    save_file({"target.position": np.concatenate([robot, -7 * robot], axis=-1)}, tensors)
+    save_file({"target.position": np.concatenate([robot, -7 * robot], axis=-1)}, tensors)  # whatever its ball does
     values = json.loads(path.read_text())
     file = Evaluation.model_validate(values | {"target": outcomes([1, 1, 0, 0], 0)})
     assert way_to_success(tensors, file) == pytest.approx((10 + 3) / 2)

@@ -53,8 +53,7 @@ def test_intervals_of_success_rates_cover_their_mean(seeds: str, count: int) -> 
     found = intervals(shares, trials=EPISODES)
     assert ((found >= 0) & (found <= 1)).all()
     assert np.mean((found[:, 0] <= mean) & (mean <= found[:, 1])) >= 0.93
-    # Student's t alone would be too narrow where seeds are near 1.
-    if seeds == "good and scattered" and count == 3:
+    if seeds == "good and scattered" and count == 3:  # Student's t alone would be too narrow where seeds are near 1
         student = intervals(shares)
         assert np.mean((student[:, 0] <= mean) & (mean <= student[:, 1])) < 0.93
 
@@ -98,8 +97,7 @@ def test_equal_shares_have_an_interval_as_wide_as_drawing_their_episodes() -> No
     equal = summarize([1.0] * 3, limit=1.0, trials=EPISODES)
     assert equal.low == pytest.approx(1 / (1 + quantile**2 / 360)) and equal.high == 1.0
     found = paired_difference(dict.fromkeys(range(3), 0.6), dict.fromkeys(range(3), 0.5), trials=EPISODES)
-    # With two successes and two failures more, of 360 episodes a side.
-    near = np.array([216 + 2, 180 + 2]) / 364
+    near = np.array([216 + 2, 180 + 2]) / 364  # with two successes and two failures more, of 360 episodes a side
     assert found and found.low == pytest.approx(0.1 - quantile * np.sqrt((near * (1 - near)).sum() / 360))
     # A variance of 0.01 / 3, or 0.04 / 9 with one seed more, is that of 0.09 * 9 / 0.04 episodes.
     extra = quantile**2 / 20.25
@@ -170,8 +168,7 @@ def test_seeds_of_a_row_are_no_independent_evidence() -> None:
 def test_what_does_not_vary_correlates_with_nothing() -> None:
     two, three = [np.array([1.0, 2.0])], np.split(np.array([0.1, 0.1, 0.3]), 3)
     assert correlation(two, two) is None and correlation(three, np.split(np.full(3, 0.1), 3)) is None
-    # Nor do the resamples in which chance left no variation.
-    found = correlation(three, three)
+    found = correlation(three, three)  # nor do the resamples in which chance left no variation
     assert found is not None and [found.low, found.high] == pytest.approx([1.0, 1.0])
 
 
@@ -216,8 +213,7 @@ def test_a_rate_is_corrected_by_what_the_prediction_explains() -> None:
     beyond = success_rate([1.0, 1.0, 0.0, 1.0], [0.2, 0.2, 0.0, 0.2], 0.9, 10**6)
     alone = stats.binomtest(3, 4).proportion_ci(method="wilson")
     assert beyond.value == pytest.approx(alone.high) and beyond.low is not None and beyond.low > 0.3
-    # Of one success in two trials none makes a rate of 0.
-    few = success_rate([1.0, 0.0], [1.0, 0.9], 0.4, 100)
+    few = success_rate([1.0, 0.0], [1.0, 0.9], 0.4, 100)  # of one success in two trials none makes a rate of 0
     assert few.value == pytest.approx(stats.binomtest(1, 2).proportion_ci(method="wilson").low)
 
 

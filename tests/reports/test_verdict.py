@@ -171,6 +171,13 @@ def test_judges_choose_the_seed_and_without_a_target_the_method() -> None:
     for chosen, percent, seed in ((("astra", 1), None, 1), (("astra", 1), 20, 0), (("nas", 2), None, 0)):
         tried = Trials(trials=4, field=2, pseudo_trials=4, percent=percent, chosen=chosen)
         assert verdict_of(results(of, judged=judged, trials=tried)).seed == seed
+    for rate, row, text in (
+        (0.9, "astra", "Deploy **ASTRA, seed 1**: success 0.90 ["),
+        (0.2, None, "Deploy none yet; best"),
+    ):
+        tried = Trials(trials=4, field=2, pseudo_trials=4, chosen=("astra", 1), rate=(rate, 0.1, 1.0))
+        found = verdict_of(results(of, judged=judged, trials=tried, tested_in="simulators"))
+        assert (found.row, found.seed) == (row, 1 if row else 0) and found.text.startswith(text)
     floor = dict.fromkeys((7, 8, 9), 0.2)
     both = [candidates[2], Candidate(row="direct_transfer", seed=0, success=floor)]
     other = [one.model_copy(update={"percent": 20, "success": dict.fromkeys((7, 8, 9), 0.1)}) for one in both]
@@ -187,8 +194,7 @@ def test_the_command_is_one_that_the_command_line_takes(percent: int, sizes: lis
     command = verdict_of(base.model_copy(update={"lines": lines})).command(tmp_path / "cart")
     assert command is not None and (f"--percent {percent} " in command) == bool(sizes)
     done = CliRunner().invoke(app, command.split()[1:])
-    # It is understood; there is no such run.
-    assert done.exit_code == 1 and "No such option" not in done.output
+    assert done.exit_code == 1 and "No such option" not in done.output  # it is understood; there is no such run
 
 
 @pytest.mark.parametrize("success", [0.9, 0.1])

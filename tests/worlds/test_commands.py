@@ -25,6 +25,7 @@ def test_the_ends_of_the_bounds_are_one() -> None:
 def test_only_what_is_given_as_an_action_is_clipped() -> None:
     torch.testing.assert_close(DRIVE.in_units(torch.tensor([7.0, -7.0])), torch.tensor([1.0, -1.5]))
     torch.testing.assert_close(DRIVE.normal(torch.tensor([1.6, -3.0])), torch.tensor([2.0, -2.0]))
+    assert driven().step(torch.full((2, 1), 2.0)).tolist() == [[pytest.approx(0.65)]] * 2  # as it was recorded
 
 
 def test_commands_of_one_are_left_to_the_bit() -> None:

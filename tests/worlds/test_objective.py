@@ -60,8 +60,7 @@ def test_a_speed_limit_shortens_and_does_not_turn(objective: Objective) -> None:
     action = torch.zeros(4, objective.action_size)
     action[:, :2] = torch.tensor([[0.6, 0.8], [3.0, -4.0], [0.03, 0.04], [0.0, 0.0]])
     limited = objective.limit_command(action, 0.5)[:, :2]
-    # ±1 along each axis comes before the limit.
-    half = 0.5 * 0.5**0.5
+    half = 0.5 * 0.5**0.5  # ±1 along each axis comes before the limit
     expected = torch.tensor([[0.3, 0.4], [half, -half], [0.03, 0.04], [0.0, 0.0]])
     torch.testing.assert_close(limited, expected)
     assert torch.equal(objective.limit_command(action[:1], 2.0), action[:1])

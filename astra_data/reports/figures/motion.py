@@ -1,6 +1,5 @@
 """Where policies go: trajectories in the maze, and identical commands in simulator and target."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -86,7 +85,9 @@ def trajectories(results: Results, scene: Scene) -> Figure | None:
             axes.tick_params(labelsize=6)
         for path in paths:
             _draw_paths(axes, *path)
-        for x, y in _cell_means(maze, goals) if maze else ():
+        cells = np.floor((goals + maze.half_extent) / maze.scale) if maze else goals[:0]
+        for cell in np.unique(cells, axis=0):  # around whose center goals scatter
+            x, y = goals[(cells == cell).all(axis=1)].mean(axis=0)
             axes.plot(x, y, "*", ms=13, mfc="#FFD23F", mec=INK, mew=0.8, zorder=6)
         title = method_title(row)  # beside which the number has to find room
         axes.set_title(title, loc="left", fontsize=TITLE_POINTS * min(1.0, TITLE_LETTERS / len(title)))
@@ -150,13 +151,6 @@ def dynamics_mismatch(time_s: Floats, command: Floats, simulated: Floats, target
     ]
     figure.legend(handles=handles, loc="outside upper center", ncols=6, columnspacing=1.2, handlelength=1.6)
     return figure
-
-
-def _cell_means(maze: Maze, goals: Floats) -> Iterator[Floats]:
-    """Yield the mean of the `goals` (N, 2) in each cell: goals scatter around its center."""
-    cells = np.floor((goals + maze.half_extent) / maze.scale)
-    for cell in np.unique(cells, axis=0):
-        yield goals[(cells == cell).all(axis=1)].mean(axis=0)
 
 
 def draw_walls(axes: Axes, maze: Maze) -> None:

@@ -94,8 +94,7 @@ def test_data_efficiency_has_a_map_per_size_and_a_band_per_method(scene: Scene) 
     *maps, success = drawn(data_efficiency(found, scene)).axes
     assert [axes.get_title() for axes in maps[:2]] == ["25 %", "100 %"]
     assert np.asarray(success.lines[0].get_xydata()) == pytest.approx(np.array([[25, 0.2], [100, 0.8]]))
-    # A seed alone has no interval, so ASTRA's band is empty.
-    band, none = success.collections
+    band, none = success.collections  # a seed alone has no interval, so ASTRA's band is empty
     assert not none.get_paths()
     at = {size: found.score_of("nas", percent=size) for size in (25, 100)}
     ends = {(x, y) for x, y in np.asarray(band.get_paths()[0].vertices).tolist()}

@@ -71,8 +71,7 @@ def scene(tmp_path: Path) -> Scene:
 def test_trajectories_draw_a_panel_per_method_with_crosses_where_episodes_fail(scene: Scene) -> None:
     assert trajectories(results("astra", "follower"), scene) is None
     write(scene.root, "astra")
-    # Where a method has none, there is no figure.
-    assert trajectories(results("astra", "follower"), scene) is None
+    assert trajectories(results("astra", "follower"), scene) is None  # where a method has none, there is no figure
     write(scene.root, "follower", simulated=False)
     figure = drawn(trajectories(results("astra", "follower"), scene))
     told = [text.get_text() for text in figure.legends[0].get_texts()]
@@ -127,8 +126,7 @@ def test_a_star_stands_at_the_mean_goal_of_each_cell_and_a_ball_has_a_path_of_it
 def test_each_axis_of_a_mismatch_has_its_own_values_and_bands() -> None:
     time_s = np.array([0.1, 0.2, 0.3])
     simulated = np.tile([1.0, 2.0, 3.0, 4.0], (3, 1))
-    # 101 robots, a meter apart in x, two in y.
-    shift = np.arange(101.0)[:, None, None] * np.array([1.0, 2.0, 0.0, 0.0])
+    shift = np.arange(101.0)[:, None, None] * np.array([1.0, 2.0, 0.0, 0.0])  # 101 robots, a meter apart in x, two in y
     command = np.tile([0.8, -0.5], (3, 1))
     target = simulated + shift
     target[1:, 2] = np.nan  # all but one have fallen before the last step, where the mean is its own

@@ -114,13 +114,11 @@ def test_a_disc_keeps_its_whole_radius_from_walls(fine_m: float, radius_m: float
 
 
 def test_a_start_in_a_blocked_cell_may_leave_but_not_go_deeper() -> None:
-    # x = 1.95 is closed; 1.85 is free, 2.05 is deeper.
-    reached, stopped = slide(ROOM, [1.95, 0.0], [1.85, 0.0])
+    reached, stopped = slide(ROOM, [1.95, 0.0], [1.85, 0.0])  # x = 1.95 is closed; 1.85 is free, 2.05 is deeper
     assert reached == pytest.approx([1.85, 0.0]) and not stopped
     reached, stopped = slide(ROOM, [1.95, 0.0], [2.05, 0.05])
     assert stopped and reached == pytest.approx([2.0, 0.05], abs=2e-4)
-    # Along the wall it is as deep everywhere.
-    reached, stopped = slide(ROOM, [1.95, 0.0], [1.95, 0.15])
+    reached, stopped = slide(ROOM, [1.95, 0.0], [1.95, 0.15])  # along the wall it is as deep everywhere
     assert reached == pytest.approx([1.95, 0.15]) and not stopped
     # Out of one wall it does not get into another, not even as deep.
     reached, stopped = slide(ROOM, [1.95, 1.85], [1.85, 1.95])

@@ -89,8 +89,7 @@ def test_paths_to_the_goal_keep_the_clearance() -> None:
 def test_starts_anywhere_cover_the_free_space_evenly_and_keep_clear_of_walls() -> None:
     points = TASK.draw_anywhere(np.random.default_rng(0), 7000)[:, :2]
     assert U_MAZE.clearance(points).min() > 0.8
-    # The two arms are mirror images.
-    assert (points[:, 1] > 0).mean() == pytest.approx(0.5, abs=0.02)
+    assert (points[:, 1] > 0).mean() == pytest.approx(0.5, abs=0.02)  # the two arms are mirror images
     arms = (np.abs(points[:, 1]) > 2).mean()
     # Arms of 10.4 m by 2.4 m (2 of them), and 5.6 m by 2.4 m of bend between them.
     assert arms == pytest.approx(2 * 10.4 * 2.4 / (2 * 10.4 * 2.4 + 4 * 2.4), abs=0.03)
@@ -253,8 +252,7 @@ def test_sensors_show_other_states_than_the_true_ones() -> None:
     expected = torch.tensor([0.1, 0.1, 0.2, 0.2, 0.3, 0.3, 0.4, 0.4])
     torch.testing.assert_close(shown.amax((0, 1)), expected, atol=0, rtol=0.03)
     torch.testing.assert_close(shown.amin((0, 1)), -expected, atol=0, rtol=0.03)
-    # A row that is set is shown as it is; the others as before.
-    before = varied.state
+    before = varied.state  # a row that is set is shown as it is; the others as before
     varied.reset_to(torch.zeros(1, 8), torch.tensor([1]))
     assert torch.equal(varied.state, torch.stack([before[0], torch.zeros(8), before[2]]))
     assert torch.equal(varied.simulator.state, torch.stack([here[0], torch.zeros(8), here[2]]))
