@@ -9,8 +9,7 @@ import pytest
 if TYPE_CHECKING:
     from fake_stages import FakeStages
 
-# Before torch and numpy are loaded: tests run side by side, a core each.
-os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch and numpy are loaded: tests run side by side, a core each
 # Nothing here has to survive a power failure, but where that is what is tested.
 os.environ.setdefault("ASTRA_DATA_NO_FSYNC", "1")
 

@@ -43,8 +43,7 @@ def write_minari(folder: Path, made: list[dict[str, Any]], data_format: str = "h
         parts["camera"] = spaces.Box(0, 255, (4, 4, 3), np.uint8)
     with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings(action="ignore"):
         patch.setenv("MINARI_DATASETS_PATH", str(folder))
-        # It warns that there is no environment, no description and the like.
-        minari.create_dataset_from_buffers(
+        minari.create_dataset_from_buffers(  # it warns that there is no environment, no description and the like
             "ant/test-v1",
             [EpisodeBuffer(id=index, **{"infos": {}} | episode) for index, episode in enumerate(made)],
             observation_space=spaces.Dict(parts) if is_dict else box(3),

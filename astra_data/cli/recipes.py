@@ -283,8 +283,7 @@ def collect(
     own = {**settings, "name": name, "out": out, "resume": resume or None}
     if arguments.of_recipe(task, "collect", own, seeds=seeds, jobs=jobs, root=root):
         return
-    # Torch's idle threads would slow down the physics; it is not loaded yet.
-    os.environ["OMP_NUM_THREADS"] = "1"
+    os.environ["OMP_NUM_THREADS"] = "1"  # torch's idle threads would slow down the physics; it is not loaded yet
     with arguments.resumable("run the same command with --resume to continue"):
         _make("collect", task, settings, seed=seeds[0] if seeds else 0, out=out, name=name, resume=resume)
 

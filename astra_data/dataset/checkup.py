@@ -196,8 +196,7 @@ class Clock:
             of_mcap = f'for MCAP, `gap_s = {HELD * period_s:.3g}` in [columns."{self.name}"]'
             split = f"`time`, and `gap_s = {GAP * period_s:.3g}` in [split], of the mapping"
             remedy = f"begin new episodes there ({split}; {of_mcap})"
-            # Many gaps are a recording of another rate, of which splits would leave crumbs.
-            if share >= MANY_GAPS:
+            if share >= MANY_GAPS:  # many gaps are a recording of another rate, of which splits would leave crumbs
                 remedy = f"resample the recording (of MCAP, take an `fps` that divides its rate), or {remedy}"
             what = f"steps of over {GAP:g} periods: {gaps}, the longest {max(longest):.3g} s"
             found.append(Finding("warning", what, f"{remedy} and import again", tuple(uids)))

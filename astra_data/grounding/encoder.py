@@ -35,8 +35,7 @@ class Members(nn.Module):
     def __init__(self, count: int, input_size: int, hidden_size: int, dropout: float) -> None:
         super().__init__()
         self.count, self.dropout = count, nn.Dropout(dropout)
-        # As of one layer, since all see the same.
-        self.first = nn.Linear(input_size, count * hidden_size)
+        self.first = nn.Linear(input_size, count * hidden_size)  # as of one layer, since all see the same
         least = hidden_size**-0.5  # as torch's layers begin
 
         def drawn(*sizes: int) -> nn.Parameter:

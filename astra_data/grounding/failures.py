@@ -151,8 +151,7 @@ class FailureModel(nn.Module):
 
 def folds(fails: Tensor, recordings: Tensor) -> list[Tensor]:
     """Split episodes (E,) at random by `recordings` (E,), those that fail alike; return who is in each of 5 at most."""
-    # Numbered as they come, so that without copies each episode is drawn for in turn.
-    known: dict[int, int] = {}
+    known: dict[int, int] = {}  # numbered as they come, so that without copies each episode is drawn for in turn
     numbered = [known.setdefault(name, len(known)) for name in recordings.tolist()]
     recording = torch.tensor(numbered, device=fails.device)
     failing = torch.bincount(recording[fails], minlength=len(known)) > 0

@@ -43,8 +43,7 @@ class ScatterModel(nn.Module):
         super().__init__()
         self.shape = shape
         self.network = mlp((shape.input_size, *shape.hidden_sizes, shape.state_size))
-        # An untrained network says that every moment is usual.
-        for parameter in list(self.network.parameters())[-2:]:
+        for parameter in list(self.network.parameters())[-2:]:  # an untrained network says that every moment is usual
             nn.init.zeros_(parameter)
         self.usual = nn.Buffer(torch.ones(shape.state_size))  # deviation of the residuals, (X,)
         self.forms = nn.Buffer(torch.zeros(shape.forms, shape.state_size))

@@ -53,8 +53,7 @@ def kicker(state: Tensor, goal: Tensor) -> Tensor:
     outward = (robot - ball) / distance
     is_behind = -(outward * to_goal).sum(-1, keepdim=True) > np.cos(_CONE_RAD)
     kicks = is_behind & (distance < _KICK_M)
-    # Along a circle about the ball, the shorter way.
-    left = torch.stack([-outward[:, 1], outward[:, 0]], dim=-1)
+    left = torch.stack([-outward[:, 1], outward[:, 0]], dim=-1)  # along a circle about the ball, the shorter way
     shorter = -(left * to_goal).sum(-1, keepdim=True).sign()
     around = shorter * left + 2 * (1 - distance / _CLEAR_M) * outward
     behind = ball - _CLEAR_M * to_goal

@@ -327,8 +327,7 @@ def _replaced(item: Item, experiment: Experiment, made_from: Mapping[str, str]) 
                 return f"made from another dataset than {named.reference}"
     read = {key: _digest(key, experiment) if experiment.has(key) else None for key in item.inputs}
     for key, digest in read.items():
-        # A choice is among the policies that the recipe has now.
-        if item.key == "select" and key not in made_from:
+        if item.key == "select" and key not in made_from:  # a choice is among the policies that the recipe has now
             return f"made without {key}"
         if digest not in (None, *made_from.values()):
             return f"made from another {key}"

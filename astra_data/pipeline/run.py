@@ -181,8 +181,7 @@ def check_device(device: str, engine: str = "processes", address: str | None = N
     if not (wanted := re.fullmatch(r"cpu|cuda(:(\d+))?", device)):
         raise BadInputError(f"expected a device such as cpu, cuda or cuda:1, got '{device}'")
     index = int(wanted[2] or 0)
-    # Ray gives each task its own GPU, which is the only one that it sees.
-    if engine == "ray" and index:
+    if engine == "ray" and index:  # Ray gives each task its own GPU, which is the only one that it sees
         raise BadInputError(f"expected device cpu or cuda on a cluster, got '{device}'")
     if engine != "ray" and device != "cpu" and index >= (found := torch.cuda.device_count()):
         raise BadInputError(f"device '{device}' is not available: torch finds {found} CUDA devices")
@@ -252,8 +251,7 @@ def make(
 
 def _prepare(task: str, user_methods: dict[str, UserMethod], folder: Path) -> None:
     """Make a process ready for an item of a recipe with this task and these methods, in a run's folder."""
-    # One thread for the networks: they are small, and idle threads would slow down other items.
-    torch.set_num_threads(1)
+    torch.set_num_threads(1)  # one for the networks: they are small, and idle threads would slow down other items
     add_all(user_methods)
     _load(task, tuple((name, own.method) for name, own in user_methods.items()), folder)
 

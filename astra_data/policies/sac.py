@@ -166,8 +166,7 @@ class Sac(Learner):
             wanted = reward + self.config.discount * ~terminated * following
         critic_loss = (critics(judging, taken) - wanted).square().mean(1).sum()
         action, log_prob = self.policy.sample(acting[:, :-1][learned])
-        # The actor must change neither the critics nor their memory to raise its own values.
-        critics.requires_grad_(False)
+        critics.requires_grad_(False)  # the actor must change neither critics nor their memory to raise its own values
         actor_loss = (temperature * log_prob - critics(judging.detach(), action).amin(0)).mean()
         critics.requires_grad_(True)
         if self._recorded is not None:

@@ -310,8 +310,7 @@ def test_still_ends_go_and_pauses_stay(tmp_path: Path) -> None:
         trim(blind, still=True, out=tmp_path / "none")
     (found,) = made(trim(logs, still=True, out=tmp_path / "out"))
     assert found.columns[STATE].tolist() == [0, 1, 1] and found.columns[NEXT_STATE].tolist() == [1, 1, 2]
-    # Without next states, the last step goes on as the one before.
-    short = write_fake(
+    short = write_fake(  # without next states, the last step goes on as the one before
         tmp_path / "short",
         [Episode(uid, {STATE: now[:6]}) for uid, now in enumerate((x, x[2:]))],
         columns=[Column(STATE)],

@@ -87,8 +87,7 @@ def test_rows_are_split_where_episodes_begin(block: int) -> None:
         ([1], [0]),
         ([2, 2], [0, 1]),
     ]
-    # Episodes may come in any order.
-    assert split([2, 2, 1], [0, 1, 0], block) == [([2, 2], [0, 1]), ([1], [0])]
+    assert split([2, 2, 1], [0, 1, 0], block) == [([2, 2], [0, 1]), ([1], [0])]  # episodes may come in any order
     # One wrong value of either stays inside of its episode.
     assert split([0, 9, 0, 1], [0, 1, 2, 0], block) == [([0, 9, 0], [0, 1, 2]), ([1], [0])]
     assert split([0, 0, 0, 1], [0, 0, 2, 0], block) == [([0, 0, 0], [0, 0, 2]), ([1], [0])]

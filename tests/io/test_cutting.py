@@ -48,8 +48,7 @@ def test_a_flag_ends_an_episode() -> None:
     cutting = cutter(split={"ends": ("end",)})
     episodes = cut(cutting, x=np.zeros(9), end=[0, 0, 0, 1, 0, 0, 1, 1, 0])
     assert rows(episodes) == [[0, 1, 2], [4, 5]] and cutting.tally.split_points == {"end": 3}
-    # Row 7 and row 8 are alone: without a next state nothing is left of them.
-    assert cutting.tally.last_rows == 4
+    assert cutting.tally.last_rows == 4  # row 7 and row 8 are alone: without a next state nothing is left of them
 
 
 def test_columns_that_are_flags_end_episodes_too() -> None:

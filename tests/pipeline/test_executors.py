@@ -243,16 +243,14 @@ def test_processes_of_items_do_not_notice_ctrl_c(tmp_path: Path) -> None:
 
 def test_ctrl_c_stops_the_processes(tmp_path: Path) -> None:
     parent = _hanging_run(tmp_path)
-    # As in a terminal, Ctrl-C reaches the whole process group.
-    os.killpg(parent.pid, signal.SIGINT)
+    os.killpg(parent.pid, signal.SIGINT)  # as in a terminal, Ctrl-C reaches the whole process group
     _, errors = parent.communicate(timeout=PATIENCE_S)
     assert errors.splitlines().count(b"KeyboardInterrupt") == 1 and _is_gone(int((tmp_path / "pid").read_text()))
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_to_a_run_in_the_background_stops_its_processes(tmp_path: Path, number: signal.Signals) -> None:
-    # A shell that starts a run with "&" has it ignore Ctrl-C.
-    parent = _hanging_run(tmp_path, handler="SIG_IGN")
+    parent = _hanging_run(tmp_path, handler="SIG_IGN")  # a shell that starts a run with "&" has it ignore Ctrl-C
     parent.send_signal(number)
     parent.send_signal(number)
     _, errors = parent.communicate(timeout=PATIENCE_S)

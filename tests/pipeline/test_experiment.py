@@ -124,8 +124,7 @@ def test_a_run_reads_what_the_base_made_and_makes_only_the_rest(
     policy = stages.asked["evaluate/astra_plus/seed_1"]["policy"]
     assert policy == folder / "train/astra_plus/seed_1" and policy.is_dir()
     assert all(found.state == "finished" for found in check(longer, root=tmp_path).values())
-    # Links and all, the runs may be moved.
-    for name in ("base", "longer"):
+    for name in ("base", "longer"):  # links and all, the runs may be moved
         shutil.move(tmp_path / name, tmp_path / f"moved/{name}")
     assert (tmp_path / "moved/longer/train/astra/seed_0").is_dir()
 

@@ -114,8 +114,7 @@ def test_other_data_of_the_same_name_are_labeled_anew(cart: Path, tmp_path: Path
     (item,) = [item for item in plan(experiment.recipe, path, experiment.folder) if item.key == "label/seed_0"]
     item.call()
     assert (experiment.folder / "label/seed_0").is_symlink() and condition(item, experiment).state == "finished"
-    # What was made of it since is no other; what was made of another is.
-    link = experiment.folder / "label/seed_0"
+    link = experiment.folder / "label/seed_0"  # what was made of it since is no other; what was made of another is
     older = shutil.copytree(whole, tmp_path / "older")
     shutil.rmtree(whole)
     filter_episodes(Dataset.open(older), without=Dataset.open(older).uids[:1].tolist(), out=whole)

@@ -12,8 +12,7 @@ from fake_items import Record, crash, fail, hang, kill_itself, rendezvous, touch
 from astra_data.core.errors import AstraDataError, BadInputError, MissingStageError
 from astra_data.pipeline.executors import SETTINGS, Item, execute_on_cluster
 
-# Ray looks when it is imported.
-os.environ |= SETTINGS
+os.environ |= SETTINGS  # Ray looks when it is imported
 ray = pytest.importorskip("ray", reason="ray is not installed: uv sync --extra ray")
 
 

@@ -82,8 +82,7 @@ def test_a_file_of_the_same_name_here_is_not_that_of_a_run(tmp_path: Path, monke
     found = settings_of("../cart/runs/cart")
     assert found["task"] == f"{tmp_path}/cart/cart.py:TASK"
     assert found["user_methods"]["damped"]["method"] == f"{tmp_path}/cart/damped.py:METHOD"
-    # With none but the wrong one, that is told by its place.
-    (tmp_path / "cart/cart.py").unlink()
+    (tmp_path / "cart/cart.py").unlink()  # with none but the wrong one, that is told by its place
     with pytest.raises(BadInputError, match=r"^cart\.py changed since \.\./cart/runs/cart was made"):
         settings_of("../cart/runs/cart")
 

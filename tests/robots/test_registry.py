@@ -69,8 +69,7 @@ def test_a_task_brings_its_own_simulator() -> None:
     assert pairing.abstract_state == task.abstract_state and registry.built(pairing, 5).state.shape == (5, 4)
     np.testing.assert_array_equal(registry.checked_abstraction(pairing, STATES), STATES[:, [0, 1, 15, 16]])
     assert registry.pairing_named("humanoid-kinematics").maze is None
-    # Commands of ±1 need no bounds.
-    assert pairing.commands is None
+    assert pairing.commands is None  # commands of ±1 need no bounds
     assert dict(registry.pairing_named("small_cart:TASK").commands or {}) == {"v": (-1.0, 4.0)}
 
 

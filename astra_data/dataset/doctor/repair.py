@@ -236,8 +236,7 @@ def remains_of(folder: Path, sources: Sequence[Dataset], notes: list[str]) -> Re
         tasks = {}
     seed = sources[0].subset_seed if sources else 0
     remains = Remains(info, columns, specs, fps, tasks, cameras, None if is_ours else rows, seed)
-    # Of what LeRobot's tools made, our metadata is no longer true, where they left it.
-    if not has_ours or sources:
+    if not has_ours or sources:  # of what LeRobot's tools made, our metadata is no longer true, where they left it
         return remains
     try:
         remains.old = read_description(folder)

@@ -137,8 +137,7 @@ def _runs_of(path: Path, columns: Columns, schema: pa.Schema, notes: list[str]) 
             held, lost = None, list(stretch)
             rows = f"rows {lost[0][0]} to {lost[-1][1] - 1}"
             notes.append(f"{_name(path)} {rows} cannot be read ({lost[0][2]})")
-    # LeRobot writes a row group per episode. With others, the last episode may be incomplete.
-    if held is not None:
+    if held is not None:  # LeRobot writes a row group per episode; with others, the last may be incomplete
         yield held, not is_whole and len(held) != last
 
 

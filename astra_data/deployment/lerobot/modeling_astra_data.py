@@ -65,8 +65,7 @@ class AstraDataPolicy(PreTrainedPolicy):  # type: ignore[misc]
                 refuse_far(row, self._about["state"])
         except ValueError as error:
             raise BadInputError(str(error)) from None
-        # The graph is of one robot.
-        rows = [part.split(1) for part in (state, goal, self._hidden)]
+        rows = [part.split(1) for part in (state, goal, self._hidden)]  # the graph is of one robot
         steps = [self._graph(*row) for row in zip(*rows, strict=True)]
         commands, hidden = zip(*steps, strict=True)
         self._hidden = torch.cat(hidden)

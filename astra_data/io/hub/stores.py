@@ -206,8 +206,7 @@ class HubStore:
                 raise BadInputError(f"{self.repo} has {known[-1].tag} already, and {why}")
         with self._api() as api:
             progress(0.0, "files")
-            # If somebody else commits from here on, this commit fails.
-            head = api.repo_info(self.repo, repo_type=KIND).sha
+            head = api.repo_info(self.repo, repo_type=KIND).sha  # if somebody commits from here on, this commit fails
             there = api.list_repo_files(self.repo, revision=head, repo_type=KIND)
             if layout.INFO_PATH in there and SUMS_PATH not in there:
                 raise BadInputError(f"{self.repo} holds a dataset that astra-data did not push; choose another one.")

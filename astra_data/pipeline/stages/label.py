@@ -124,8 +124,7 @@ def with_outcomes(task: Task, episode: Episode, seed: int) -> Episode:
     success = torch.from_numpy(given[names.SUCCESS]) if names.SUCCESS in given else reached.clone()
     failed = (over | missed) & ~success
     if names.SUCCESS in given:
-        # That what is to last did so ends no episode.
-        reached = reached if task.objective.is_lasting else success
+        reached = reached if task.objective.is_lasting else success  # that what is to last did so ends no episode
     else:
         late = slice(task.objective.horizon - 1, None)
         success[late] = task.objective.succeeded(reached[late], failed[late], task.objective.horizon)

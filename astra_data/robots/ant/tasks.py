@@ -84,8 +84,7 @@ def torques_to_body(torques: Floats, quarters: NDArray[np.intp]) -> Floats:
     hips = torques[:, :4][batch, legs]
     ankles = torques[:, 4:][batch, legs] * _ANKLE_SIGNS
     body = np.stack([hips, ankles], axis=-1)
-    # The model lists its actuators from leg 4, then 1, 2, 3.
-    return np.roll(body, 1, axis=1).reshape(-1, 8)
+    return np.roll(body, 1, axis=1).reshape(-1, 8)  # the model lists its actuators from leg 4, then 1, 2, 3
 
 
 class VelocityController:

@@ -318,8 +318,7 @@ def humanoid_to_walker2d(state: Tensor) -> Tensor:
     height, spin = state[..., _HEIGHT], state[..., _SPIN]
     joints, turn = state[..., _JOINTS], rotation(state[..., _QUATERNION])
     velocity = _headed(turn, state[..., _VELOCITY])
-    # The vertical components of the torso's axes.
-    forward, left, up = turn[..., 2, :].unbind(-1)
+    forward, left, up = turn[..., 2, :].unbind(-1)  # the vertical components of the torso's axes
     level = torch.hypot(left, up).clamp_min(1e-6)
     pitch = torch.atan2(-forward, level)
     pitch_rate = (up * spin[..., 1] - left * spin[..., 2]) / level

@@ -101,8 +101,7 @@ class HumanoidWalker2d(FreeStates):
         motion, sunk = self.state[:, _MOTION].cpu().double(), self.memory[:, 0].cpu()
         motion[:, 0] += sunk
         targets = humanoid.commanded_angles(action.cpu().double()).numpy()
-        # Before z comes x, which is 0 at the start of every step.
-        placed = np.pad(motion.numpy(), ((0, 0), (1, 0)))
+        placed = np.pad(motion.numpy(), ((0, 0), (1, 0)))  # before z comes x, which is 0 at the start of every step
         landed = self._steps(self._models, placed, targets, substeps=humanoid.CONTROL_SUBSTEPS)
         motion = torch.from_numpy(landed[:, 1:].copy())
         contacts = (sole_clearance(motion[:, _POSE]) < humanoid.CONTACT_M).to(motion.dtype)

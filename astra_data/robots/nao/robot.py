@@ -26,8 +26,7 @@ WALL_HEIGHT_M = 0.5
 TICKS = 16  # per control step
 FALLEN_COSINE = 0.7  # a robot has fallen when the cosine between its up axis and the vertical is below this (45°)
 MOTORS = len(walk.TO_MOTORS)
-# Ankles among the motors: pitch, roll; left, right.
-_ANKLES = ((4, 5), (10, 11))
+_ANKLES = ((4, 5), (10, 11))  # ankles among the motors: pitch, roll; left, right
 CONTROL_STEP_S = TICKS * walk.TICK_S
 _BALL = 7 + MOTORS
 _MIDDLE_M = 0.03  # either foot may kick a ball that is less far to the side: the torso sways as far from step to step

@@ -372,12 +372,10 @@ NAVIGATION = _task(
         spread_m=0.05,
         start_clearance_m=0.3,
         start_offsets_m=((0.0, 0.0), (0.5, 0.0), (1.0, 0.0)),
-        # A touch costs as much as a meter; if it cost a third of the path, policies would learn to stand.
-        meter_reward=4.0,
+        meter_reward=4.0,  # a touch costs a meter; if it cost a third of the path, policies would learn to stand
         failure_reward=-4.0,
         path_clearance_m=0.25,
-        # Policies without a memory, whose position is not in the latent, do not learn it without these.
-        position_waves=3,
+        position_waves=3,  # without a memory, policies whose position is not in the latent need these to learn it
         ends_at_walls=True,
     ),
     make_simulator=partial(PointMass, S_MAZE, **_BODY),

@@ -259,8 +259,7 @@ def _plan(gait: Gait, velocity: Floats, called: Bools, begins: Bools) -> None:
     x = _nearer_zero_or_up_to(gait.forward_m_s, x, LIMITS.slow_down_m_s, LIMITS.speed_up_m_s)
     closed = (gait.after == 0).all(axis=1)
     kind = np.where(gait.kind == STOP, START, np.where(closed & ~called, STOP, STRIDE))
-    # The first stride is that of the foot on the side that the command leads to.
-    sideways = np.where(y != 0, y, turn)
+    sideways = np.where(y != 0, y, turn)  # the first stride is that of the foot on the side that the command leads to
     left_swings = np.where((kind == START) & (sideways != 0), sideways < 0, ~gait.left_swings)
     leads_y, leads_turn = left_swings == (y > 0), left_swings == (turn > 0)
     duration = LIMITS.step_s + LIMITS.step_s_per_sideways_m_s * np.abs(y)
@@ -335,5 +334,4 @@ def _nearer_zero_or_up_to(speed: Floats, wanted: Floats, loss: float, gain: floa
     """Return `wanted` (B,), limited to `gain` away from zero and `loss` toward it from `speed` (B,)."""
     direction = np.where(speed != 0, np.sign(speed), np.sign(wanted))
     along = np.clip(wanted * direction, np.abs(speed) - loss, np.abs(speed) + gain)
-    # Beyond zero the limit of a gain holds again.
-    return np.asarray(direction * np.maximum(along, -gain))
+    return np.asarray(direction * np.maximum(along, -gain))  # beyond zero the limit of a gain holds again

@@ -196,8 +196,7 @@ class GoalDistance:
         away_x, away_y = goal[:, :1] - self.lattice[:, 0], goal[:, 1:] - self.lattice[:, 1]
         field = (away_x.square() + away_y.square()).argmin(dim=1)
         _, height, width = self.fields.shape
-        # Values are those at cell centers.
-        x, y = ((position + self.half_extent) / self.cell_m - 0.5).unbind(-1)
+        x, y = ((position + self.half_extent) / self.cell_m - 0.5).unbind(-1)  # values are those at cell centers
         x, y = x.clamp(0, width - 1.001), y.clamp(0, height - 1.001)
         column, row = x.floor(), y.floor()
         fx, fy = x - column, y - row

@@ -41,8 +41,7 @@ def test_every_version_keeps_its_tag_and_main_shows_the_newest(hub: Hub, fake: D
     push(fake.root, "me/it")
     repo = hub.repos["me/it"]
     first = dict(repo.tags)
-    # A file of an earlier version that the next one does not have.
-    left = repo.commits[repo.head] | {
+    left = repo.commits[repo.head] | {  # a file of an earlier version that the next one does not have
         "data/chunk-000/file-001.parquet": b"",
         "meta/old.json": b"",
         "videos/a/old.mp4": b"",

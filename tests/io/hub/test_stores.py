@@ -209,8 +209,7 @@ def test_missing_rights_are_told(s3: str, fake: Dataset, monkeypatch: pytest.Mon
 @pytest.mark.parametrize(("url", "module", "extra"), [("s3://b/x", "s3fs", "s3"), ("gs://b/x", "gcsfs", "gcs")])
 def test_a_missing_back_end_is_told(url: str, module: str, extra: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, module, None)
-    # fsspec remembers what it has imported before.
-    known = sys.modules["fsspec.registry"].__dict__["_registry"]
+    known = sys.modules["fsspec.registry"].__dict__["_registry"]  # fsspec remembers what it has imported before
     monkeypatch.delitem(known, url.partition(":")[0], raising=False)
     told = rf"is not installed: uv sync --extra {extra}"
     with pytest.raises(BadInputError, match=told):

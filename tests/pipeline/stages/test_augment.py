@@ -103,8 +103,7 @@ def test_copies_are_their_source_moved_as_they_say(collected: Path, augmented: P
             np.testing.assert_allclose(after[:, 15:18], before[:, 15:18] @ turn.T, atol=1e-5)
             turned = turn @ rotation_matrix(before[:, 3:7])
             np.testing.assert_allclose(rotation_matrix(after[:, 3:7]), turned, atol=1e-5)
-            # The rates about the body's axes stay.
-            np.testing.assert_array_equal(after[:, 18:21], before[:, 18:21])
+            np.testing.assert_array_equal(after[:, 18:21], before[:, 18:21])  # the rates about the body's axes stay
         np.testing.assert_allclose(copy.columns[ACTION], cut.columns[ACTION] @ turn[:2, :2].T, atol=1e-6)
         assert np.abs(copy.columns[ACTION]).max() <= 1 + 1e-6
         paths = (np.diff(episode.columns[STATE][:, :2], axis=0) for episode in (copy, cut))

@@ -192,8 +192,7 @@ def test_it_goes_on_from_its_checkpoint(
     _, metadata = suboptimal_by_ppo(task, **given, progress=silent)
     assert [one.went_on_from for one in Counting.made] == [0, 100] and Counting.made[-1].goes_on == episodes_go_on
     assert metadata["trained_steps"] == 300
-    # What is finished is not trained again.
-    suboptimal_by_ppo(task, **given, progress=silent)
+    suboptimal_by_ppo(task, **given, progress=silent)  # what is finished is not trained again
     assert Counting.made[-1].steps == Counting.made[-1].went_on_from == 300
 
 

@@ -177,8 +177,7 @@ def test_publishing_adds_to_what_is_there(
     found = read_results(file)
     assert found.values("astra", "success") == {0: 0.5, 1: 0.25, 2: 0.75}
     assert found.values("astra_plus", "success") == {0: 1.0, 1: 0.75}
-    # The trajectories of ASTRA+ are not here: the figure stays as it is.
-    page = (folder / "results.md").read_text()
+    page = (folder / "results.md").read_text()  # the trajectories of ASTRA+ are not here: the figure stays as it is
     assert "](trajectories.png)" in page and (folder / "trajectories.png").read_bytes() == drawn
     assert not caplog.records
     # A changed result replaces the earlier one, and it is said.
@@ -229,8 +228,7 @@ def test_sizes_are_set_side_by_side(rough: None, tmp_path: Path, monkeypatch: py
             write_fake(root / artifact_key("subset", "", seed, percent))
     for seed in SEEDS[:2]:
         write_evaluation(root, "direct_transfer", seed, 100)
-    # At 50 % one seed of ASTRA is worse.
-    path = root / artifact_key("evaluate", "astra", 2, 50) / "evaluation.json"
+    path = root / artifact_key("evaluate", "astra", 2, 50) / "evaluation.json"  # at 50 % one seed of ASTRA is worse
     edit_json(path, target=outcomes([0, 0, 0, 0], 2))
     asked = {"seeds": [*SEEDS, 7], "sweep": {"percent": [10, 100, 50]}}
     sized = FakeRecipe(name="sizes", methods=("direct_transfer", "astra"), percents=(10, 100, 50), settings=asked)

@@ -116,8 +116,7 @@ def test_the_view_of_an_ant_that_looks_along_its_command_is_read_off() -> None:
 
 
 def test_torques_to_body_undoes_the_view() -> None:
-    # The same canonical torques move the turned body exactly as the unturned one.
-    rng = np.random.default_rng(4)
+    rng = np.random.default_rng(4)  # the same canonical torques move the turned body exactly as the unturned one
     model = tasks.ant_model()
     command = np.array([[1.0, 0.2], [1.0, 0.2]])
     qpos, qvel = model.qpos0.copy(), np.zeros(14)
@@ -183,8 +182,7 @@ def rolled(env: tasks.AntMazeEnv, rows: list[int], angle: float) -> None:
 
 @pytest.mark.parametrize(
     ("degrees", "toppled"),
-    # A cosine of 0.2 is that of 78.5 degrees.
-    [(0.0, False), (76.0, False), (81.0, True), (180.0, True)],
+    [(0.0, False), (76.0, False), (81.0, True), (180.0, True)],  # a cosine of 0.2 is that of 78.5 degrees
 )
 def test_toppling_is_a_matter_of_the_up_axis(degrees: float, toppled: bool) -> None:
     env = placed([[-4, 4], [-4, 4]])

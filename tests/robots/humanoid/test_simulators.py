@@ -192,7 +192,6 @@ def test_the_torso_turns_on_and_ever_slower() -> None:
         after = simulator.step(torch.zeros(1, 4))[0]
     slowed = math.exp(-20 * 0.015 / 0.3)
     torch.testing.assert_close(after[43:], slowed * spin, atol=1e-5, rtol=0)
-    # Leaning forward, its own forward axis points down: up is behind.
-    lean = 0.8 * 0.3 * (1 - slowed)
+    lean = 0.8 * 0.3 * (1 - slowed)  # leaning forward, its own forward axis points down: up is behind
     expected = torch.tensor([-math.sin(lean), 0.0, math.cos(lean)])
     torch.testing.assert_close(after[40:43], expected, atol=0.01, rtol=0)

@@ -84,8 +84,7 @@ def test_the_walkers_mass_moves_as_mujoco_says() -> None:
 def test_joints_are_paid_for_the_way_of_the_torso_over_the_lower_foot() -> None:
     objective, model = tasks.JointWalking(horizon=5), humanoid.humanoid_model()
     data = mujoco.MjData(model)
-    # The left knee is drawn up, so that the right foot is the lower one; then both hips turn.
-    poses = np.zeros((2, 17))
+    poses = np.zeros((2, 17))  # the left knee is drawn up, so that the right foot is the lower one; then both hips turn
     poses[:, humanoid.COMMANDED[1]] = -1.0
     poses[1, [humanoid.COMMANDED[0], humanoid.COMMANDED[2]]] = 0.02, 0.1
     feet = []

@@ -56,8 +56,7 @@ def one(count: int = 1) -> kicking.BallAgent:
 def test_it_walks_into_its_ball() -> None:
     simulator = one()
     state = simulator.step(AHEAD)
-    # The ball leaves at 1 m/s from 0.19 m ahead of 0.05 m, and rolls for 0.2 s.
-    way = 1.0 * 0.2 - 0.3 * 0.2**2 / 2
+    way = 1.0 * 0.2 - 0.3 * 0.2**2 / 2  # the ball leaves at 1 m/s from 0.19 m ahead of 0.05 m, and rolls for 0.2 s
     expected = [0.05, 0.0, 0.25, 0.0, 0.05 + 0.19 + way, 0.0, 1.0 - 0.3 * 0.2, 0.0]
     assert state[0].tolist() == pytest.approx(expected, abs=1e-5)
     for _ in range(100):
@@ -71,8 +70,7 @@ def test_it_stands_and_kicks() -> None:
     state = simulator.step(torch.tensor([[1.0, 0.0, 1.0]]).expand(2, 3))
     way = 1.5 * 0.2 - 0.3 * 0.2**2 / 2
     assert state[0].tolist() == pytest.approx([0, 0, 0, 0, 0.22 + way, 0, 1.5 - 0.3 * 0.2, 0], abs=1e-5)
-    # Out of reach.
-    assert state[1].tolist() == pytest.approx([0, 0, 0, 0, 0.32, 0, 0, 0], abs=1e-5)
+    assert state[1].tolist() == pytest.approx([0, 0, 0, 0, 0.32, 0, 0, 0], abs=1e-5)  # out of reach
     turned = VariedPlanar(one(), BallVariation(contact_direction_deg=(90.0, 90.0)))
     turned.reset_to(START)
     state = turned.step(torch.tensor([[0.0, 0.0, 1.0]]))
@@ -97,8 +95,7 @@ def test_parameters_do_what_their_names_say(variation: BallVariation, entry: int
 def test_a_correction_moves_no_ball_that_lies_untouched() -> None:
     simulator = one(3)
     states = START.repeat(3, 1)
-    # The first is walked away from, the second rolls, the third is walked into.
-    states[1, 6] = 0.3
+    states[1, 6] = 0.3  # the first is walked away from, the second rolls, the third is walked into
     simulator.reset_to(states)
     simulator.step(torch.cat([-AHEAD, -AHEAD, AHEAD]))
     landed = torch.tensor([0.1, 0.1, 0.2, 0.2, 0.5, 0.5, 0.4, 0.4]).repeat(3, 1)
@@ -115,8 +112,7 @@ def test_a_ball_that_rolls_keeps_to_its_way_as_fast_as_corrected(friction: float
     simulator.reset_to(rolling)
     simulator.step(STAY)
     landed = torch.tensor([[0.1, 0.1, 0.2, 0.2, 3.0, 3.0, -0.3, 0.4]])
-    # From some speed to 0.5 m/s in 0.2 s.
-    way = 0.5 * 0.2 + 0.3 * friction * 0.2**2 / 2
+    way = 0.5 * 0.2 + 0.3 * friction * 0.2**2 / 2  # from some speed to 0.5 m/s in 0.2 s
     expected = torch.tensor([[1.0 + 0.8 * way, 0.5 - 0.6 * way, 0.8 * 0.5, -0.6 * 0.5]])
     torch.testing.assert_close(simulator.settle(rolling, landed)[:, 4:], expected)
 
@@ -137,8 +133,7 @@ def test_a_correction_says_how_likely_a_ball_that_lies_is_hit(before_m_s: float,
     hit = speed > 0
     # Balls that are hit are first measured at 0.2 m/s, so 0.1 m/s are half a hit.
     assert hit.float().mean().item() == pytest.approx(0.5, abs=0.01)
-    # It leaves at 0.5 m/s, and is slowed by 0.3 m/s² in the 0.2 s that it rolls.
-    slowed = 0.3 * friction
+    slowed = 0.3 * friction  # it leaves at 0.5 m/s, and is slowed by 0.3 m/s² in the 0.2 s that it rolls
     torch.testing.assert_close(speed[hit], torch.full_like(speed[hit], 0.5 - slowed * 0.2))
     rolled = torch.full_like(speed[hit], 0.5 * 0.2 - slowed * 0.2**2 / 2)
     torch.testing.assert_close(way[hit].norm(dim=-1), rolled)
@@ -199,8 +194,7 @@ def test_starts_are_where_the_task_says() -> None:
     near = TASK.draw_anywhere(np.random.default_rng(0), 4000)
     near_m = np.linalg.norm(near[:, :2] - near[:, 4:6], axis=1)
     assert [near_m.min(), near_m.max()] == pytest.approx([0.18, 0.5], abs=0.01)
-    # All around the ball.
-    to_goal = np.array([1.5, 0.0]) - ball
+    to_goal = np.array([1.5, 0.0]) - ball  # all around the ball
     ahead = ((robot - ball) * to_goal).sum(axis=1) > 0
     assert ahead.mean() == pytest.approx(0.5, abs=0.03)
 

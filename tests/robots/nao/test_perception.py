@@ -52,8 +52,7 @@ def test_errors_are_as_large_as_told() -> None:
         seen.append(place.pose.copy())
     expected = [np.hypot(0.03, 0.005)] * 2 + [np.radians(2.0)]
     assert seen[-1].std(axis=0) == pytest.approx(expected, rel=0.04)
-    # Errors 2 s apart are correlated by 1 / e.
-    apart = round(2.0 / STEP_S)
+    apart = round(2.0 / STEP_S)  # errors 2 s apart are correlated by 1 / e
     both = np.corrcoef(seen[-1][:, 2], seen[-1 - apart][:, 2])[0, 1]
     assert both == pytest.approx(np.exp(-apart * STEP_S / 2.0), abs=0.05)
 

@@ -30,8 +30,7 @@ def test_masses_and_joints_are_the_published_ones() -> None:
             np.testing.assert_array_equal(model.joint(side + name).axis, axis)
         hip = model.joint(f"{side}HipYawPitch").axis
         np.testing.assert_allclose(hip, (0.0, 0.5**0.5, -sign * 0.5**0.5))
-        # Roll angles and the ranges of their joints are mirrored.
-        roll = model.joint(f"{side}HipRoll").range
+        roll = model.joint(f"{side}HipRoll").range  # roll angles and the ranges of their joints are mirrored
         np.testing.assert_allclose(np.degrees(np.sort(sign * roll)), (-21.74, 45.29))
     assert model.body_mass.sum() == pytest.approx(5.36, abs=0.005)
 
@@ -108,12 +107,10 @@ def test_angles_arrive_after_their_delay() -> None:
     for row in range(3):
         np.testing.assert_allclose(robots.sent[row, FIRST:], expected)
         np.testing.assert_array_equal(robots.sent[row, :FIRST], np.tile(STANDING[legs.TO_MOTORS], (FIRST, 1)))
-    # What the servos held in the last tick is the end of a saved state.
-    controls = robots.state[:, -MOTORS:]
+    controls = robots.state[:, -MOTORS:]  # what the servos held in the last tick is the end of a saved state
     for row, delay in enumerate((0, 2, 3)):
         np.testing.assert_allclose(controls[row], expected[TICKS - 1 - delay])
-    # The last ticks of this control step are the first of the next.
-    robots.advance(np.arange(3), targets(3), noise(3))
+    robots.advance(np.arange(3), targets(3), noise(3))  # the last ticks of this control step are the first of the next
     np.testing.assert_allclose(robots.sent[:, :FIRST], np.tile(expected[-FIRST:], (3, 1, 1)))
 
 

@@ -87,7 +87,6 @@ def test_states_tell_the_planned_velocity_in_the_world() -> None:
     one.localisation.pose[:, 2] = heading
     gait = one.robots.gait
     gait.before[:], gait.after[:], gait.duration_s[:] = [0.02, 0.01, 0.1], [0.04, -0.05, 0.1], 0.25
-    # Half of 6 cm forward and of 4 cm to the right in 0.25 s.
-    planned = (0.12 - 0.08j) * np.exp(1j * heading)
+    planned = (0.12 - 0.08j) * np.exp(1j * heading)  # half of 6 cm forward and of 4 cm to the right in 0.25 s
     np.testing.assert_allclose(one.state[:, 4:6], np.column_stack([planned.real, planned.imag]), atol=1e-6)
     np.testing.assert_allclose(one.state[:, 26:29], np.tile([0.12, -0.08, 0.4], (3, 1)), atol=1e-6)

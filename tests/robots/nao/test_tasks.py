@@ -27,8 +27,7 @@ def test_abstract_states_keep_the_entries_of_their_names(task: Task) -> None:
     np.testing.assert_array_equal(task.abstraction(eye.double().numpy()), kept)
     assert torch.equal(task.beyond(eye).any(dim=1), ~kept.any(dim=1))
     for name, entries in task.quantities.items():
-        # E.g. "ball_velocity_m_s": ball_vx and ball_vy, in m/s.
-        words = abstract.astra or {}
+        words = abstract.astra or {}  # e.g. "ball_velocity_m_s": ball_vx and ball_vy, in m/s
         unit = "m/s" if name.endswith("m_s") else "m"
         assert [words["unit"][entry] for entry in entries] == [unit] * 2
         assert all(abstract.labels[entry].startswith("ball") == name.startswith("ball") for entry in entries)

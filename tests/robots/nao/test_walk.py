@@ -36,8 +36,7 @@ def test_angles_bring_the_feet_where_they_should_be() -> None:
 
 
 def test_feet_turned_against_each_other_reach_their_yaw() -> None:
-    # What one motor can do: mirror images.
-    poses = random_poses(200)
+    poses = random_poses(200)  # what one motor can do: mirror images
     poses[:, 1] = poses[:, 0] * [1, -1, 1, -1, 1, -1]
     np.testing.assert_allclose(foot_poses(walk.leg_angles(poses)), poses, atol=1e-9)
 
@@ -87,8 +86,7 @@ def strides(command: Floats, seconds: float, gait: walk.Gait | None = None) -> l
         ((0, 0.9, 0), (0, 0.2, 0)),
         ((0, 0, -9.0), (0, 0, -np.radians(120))),
         ((0.1, 0.05, 0), (0.1, 0.05, 0)),
-        # On the ellipse.
-        ((0.25, 0.2, 0), (0.25 * 0.5**0.5, 0.2 * 0.5**0.5, 0)),
+        ((0.25, 0.2, 0), (0.25 * 0.5**0.5, 0.2 * 0.5**0.5, 0)),  # on the ellipse
         # A turn that leaves nothing of the forward speed: 24 degrees in the wider step.
         ((0.25, 0, np.radians(24) / 0.5 / 0.67), (0, 0, np.radians(24) / 0.5 / 0.67)),
         ((0.25, 0, np.radians(12) / 0.5 / 0.67), (0.25 * 0.75, 0, np.radians(12) / 0.5 / 0.67)),
@@ -118,8 +116,7 @@ def test_the_leading_foot_goes_aside_and_the_other_follows() -> None:
         assert seen[0].left_swings[0] == (sign > 0)
         for gait in seen:
             leads = gait.left_swings[0] == (sign > 0)
-            # 0.25 s and 0.15 ms per mm/s.
-            assert gait.duration_s[0] == pytest.approx(0.28)
+            assert gait.duration_s[0] == pytest.approx(0.28)  # 0.25 s and 0.15 ms per mm/s
             assert gait.after[0, 1] == pytest.approx(sign * 0.2 * 0.56 if leads else 0.0)
 
 
