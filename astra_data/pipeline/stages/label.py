@@ -167,6 +167,8 @@ def check_fits(source: Dataset, task: Task) -> None:
     if names.GOAL in source.features and (found := source.features[names.GOAL]["shape"][0]) != goal_size:
         fault = f"has {found} values, goals of {task.name} have {goal_size}"
         faults.append(f"{names.GOAL} {fault}: import it without that column")
+    kinds = {flag.name: source.features.get(flag.name, {}).get("dtype", "bool") for flag in names.OUTCOME_COLUMNS[1:]}
+    faults += [f"{name} is {kind}, expected bool" for name, kind in kinds.items() if kind != "bool"]
     if names.NEXT_STATE not in source.features:
         faults.append(f"has no column {names.NEXT_STATE}")
     if faults:

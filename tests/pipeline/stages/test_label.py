@@ -219,6 +219,11 @@ def test_what_is_no_log_of_the_task_is_refused(tmp_path: Path) -> None:
     logs = write(tmp_path / "logs", [drive(0.1, 3)])
     with pytest.raises(BadInputError, match=r"observation.state has 2 values, expected those of antmaze-umaze: 29"):
         label("antmaze-umaze", data=logs, out=tmp_path / "out")
+    numbers = write(
+        tmp_path / "numbers", [drive(0.1, 3) | {TERMINATED: np.zeros(3, np.float32)}], (Column(TERMINATED),)
+    )
+    with pytest.raises(BadInputError, match=f"{TERMINATED} is float32, expected bool"):
+        label(CART, data=numbers, out=tmp_path / "out")
     labeled = label(CART, data=logs, out=tmp_path / "labeled")
     with pytest.raises(BadInputError, match="already has goals and outcomes: there is nothing to label"):
         label(CART, data=labeled)
