@@ -9,6 +9,7 @@ from toy_episodes import toy_episodes
 
 from astra_data.core.progress import Progress, silent
 from astra_data.grounding import fit as fit_module
+from astra_data.grounding.encoder import HistoryEncoder
 from astra_data.grounding.fit import Fitting, GroundConfig, HistoryFit, recorded_clearance_m, with_own_rewards
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.model import GroundingModel, GroundingShape, LossWeights
@@ -112,6 +113,11 @@ def test_scales_and_sizes_are_of_the_training_episodes(tmp_path: Path, monkeypat
     shape = grounding.model.shape
     assert (shape.position_octaves, shape.ball_index) == (0, 2)
     assert not {"loss_latent", "loss_reward"} & metrics["epochs"][0].keys()
+    seen: list[int] = []
+    monkeypatch.setattr("astra_data.grounding.encoder.check_encoder", lambda _, inputs: seen.append(inputs.shape[1]))
+    monkeypatch.setattr(Task, "ball_rolls", True)
+    own, _, _ = fit(tmp_path / "own", replace(of, encoder=HistoryEncoder), task=placeless, window=8)
+    assert seen == [8] and own.model.shape.ball_rolls
 
 
 def test_all_that_is_drawn_comes_from_the_seed(tmp_path: Path) -> None:
