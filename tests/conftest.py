@@ -10,8 +10,7 @@ if TYPE_CHECKING:
     from fake_stages import FakeStages
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch and numpy are loaded: tests run side by side, a core each
-# Nothing here has to survive a power failure, but where that is what is tested.
-os.environ.setdefault("ASTRA_DATA_NO_FSYNC", "1")
+os.environ.setdefault("ASTRA_DATA_NO_FSYNC", "1")  # nothing has to survive a power failure, but where that is tested
 
 
 @pytest.fixture

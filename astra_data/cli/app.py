@@ -13,7 +13,7 @@ from typer.core import TyperArgument, TyperOption
 from astra_data.cli import arguments, datasets, recipes, sharing
 from astra_data.core.durable import NO_FSYNC, disk_error
 from astra_data.core.errors import AstraDataError, BadInputError, missing_extra
-from astra_data.core.naming import in_lines
+from astra_data.core.naming import in_lines, is_text
 
 app = typer.Typer(
     help="Turn robot logs into datasets, and datasets into policies trained in a simplified simulator.",
@@ -51,7 +51,7 @@ def _options(
         names = [*sys.argv, os.getcwd()]
     except FileNotFoundError:
         raise BadInputError("the folder that this shell is in was removed or replaced: cd to it again") from None
-    if unsound := [name for name in names if name.encode(errors="ignore").decode() != name]:
+    if unsound := [name for name in names if not is_text(name)]:
         raise BadInputError(f"{', '.join(unsound)}: expected names in UTF-8: choose others")
     if logging.lastResort is not None:  # what prints warnings
         logging.lastResort.setFormatter(_InLines())

@@ -4,6 +4,7 @@ import html
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import TypeGuard
 
 PLUS = "_plus"
 RECORD = "recipe.json"  # in the folder of a run: the settings that its artifacts were made with
@@ -55,6 +56,11 @@ def first_few(words: Sequence[object], most: int) -> str:
 def shortened(text: str, most: int) -> str:
     """Return the first `most` characters of `text`, with an ellipsis where there are more."""
     return text if len(text) <= most else f"{text[:most]}…"
+
+
+def is_text(value: object) -> TypeGuard[str]:
+    """Return whether `value` is a text that can be written as UTF-8; names of files that are not UTF-8 cannot."""
+    return isinstance(value, str) and not re.search("[\ud800-\udfff]", value)
 
 
 def printable(text: str) -> str:

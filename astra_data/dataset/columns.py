@@ -7,18 +7,18 @@ A column with one value per step has shape (T,), all others (T, size): never (T,
 """
 
 import hashlib
-import re
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from astra_data.core.arrays import as_column
 from astra_data.core.errors import BadInputError, in_short, unmet
+from astra_data.core.naming import is_text
 
 STATE = "observation.state"  # (T, S) float32: the full target state s_t
 GOAL = "observation.environment_state"  # (T, G) float32: the goal, if any; LeRobot's own policies need it to train
@@ -44,12 +44,6 @@ ROLES = {"position": 2, "vector": 2, "heading": 1, "quaternion": 4, "invariant":
 """How a change of the planar frame acts on values (see `Column.astra`), and on how many of them at once."""
 Array = NDArray[Any]
 Scalar = float | int | bool | str
-_SURROGATE = re.compile("[\ud800-\udfff]")
-
-
-def is_text(value: object) -> TypeGuard[str]:
-    """Return whether `value` is a text that can be written as UTF-8; names of files that are not UTF-8 cannot."""
-    return isinstance(value, str) and not _SURROGATE.search(value)
 
 
 @dataclass(frozen=True)

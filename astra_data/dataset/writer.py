@@ -14,11 +14,12 @@ import pyarrow.parquet as pq
 
 from astra_data.core import durable
 from astra_data.core.errors import AstraDataError, BadInputError, CorruptDatasetError, DiskError, in_short, unmet
+from astra_data.core.naming import is_text
 from astra_data.dataset import columns as names
 from astra_data.dataset import description as described
 from astra_data.dataset import format as layout
 from astra_data.dataset.cameras import ClipWriter, images
-from astra_data.dataset.columns import Column, Episode, Scalar, is_text
+from astra_data.dataset.columns import Column, Episode, Scalar
 from astra_data.dataset.format import to_arrow, to_numpy
 from astra_data.dataset.plain import flag_faults, open_end_faults, read_object
 from astra_data.dataset.reader import Dataset

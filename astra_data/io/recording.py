@@ -13,8 +13,8 @@ from typing import IO, cast
 from astra_data.core.config import MOST_KNOWN, did_you_mean
 from astra_data.core.durable import file_digest, files_below
 from astra_data.core.errors import BadInputError, in_short
-from astra_data.core.naming import first_few
-from astra_data.dataset.columns import Array, is_text
+from astra_data.core.naming import first_few, is_text
+from astra_data.dataset.columns import Array
 from astra_data.dataset.format import INFO_PATH
 from astra_data.dataset.plain import read_object
 from astra_data.io.mapping import ImportMapping

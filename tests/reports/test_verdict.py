@@ -171,10 +171,8 @@ def test_judges_choose_the_seed_and_without_a_target_the_method() -> None:
     for chosen, percent, seed in ((("astra", 1), None, 1), (("astra", 1), 20, 0), (("nas", 2), None, 0)):
         tried = Trials(trials=4, field=2, pseudo_trials=4, percent=percent, chosen=chosen)
         assert verdict_of(results(of, judged=judged, trials=tried)).seed == seed
-    for rate, row, text in (
-        (0.9, "astra", "Deploy **ASTRA, seed 1**: success 0.90 ["),
-        (0.2, None, "Deploy none yet; best"),
-    ):
+    ends = {0.9: ("astra", "Deploy **ASTRA, seed 1**: success 0.90 ["), 0.2: (None, "Deploy none yet; best")}
+    for rate, (row, text) in ends.items():
         tried = Trials(trials=4, field=2, pseudo_trials=4, chosen=("astra", 1), rate=(rate, 0.1, 1.0))
         found = verdict_of(results(of, judged=judged, trials=tried, tested_in="simulators"))
         assert (found.row, found.seed) == (row, 1 if row else 0) and found.text.startswith(text)

@@ -112,7 +112,7 @@ def test_what_was_given_stays_where_a_field_is_replaced() -> None:
         assert other.abstract_state == replace(given["abstract_state"], name="abstract.state")
 
 
-@pytest.mark.parametrize("given", [(), (0,), (1, 0), (0, 2), (0, 1), (2, 3, 4)])
+@pytest.mark.parametrize("given", [(), (0,), (1, 0), (0, 2), (-2, -1), (0, 1), (0, 1, 2), (2, 3, 4)])
 def test_a_ball_is_at_two_indices_in_a_row(given: tuple[int, ...]) -> None:
     wanted = "quantities: ball_position_m: expected two indices in a row, of x and y, after the robot's, got "
     with pytest.raises(BadInputError, match=wanted + re.escape(str(given))):

@@ -160,14 +160,12 @@ def _columns(dataset: Dataset) -> str:
 def _provenance(description: dict[str, Any]) -> str:
     parents = [f"{full_name(parent)} ({in_code(parent['hash'])})" for parent in description["parents"]]
     packages = [f"{name} {version}" for name, version in description["packages"].items()]
+    made = {key: description[key] for key in ("config", "seeds", "environment", "simulator")}
     rows = [
         ("version", description["version"]),
         ("made by stage", in_markdown(description["stage"])),
         ("from", "; ".join(parents) or "nothing earlier"),
-        *(
-            (key, in_code(json.dumps(of, ensure_ascii=False)) if (of := description[key]) else "none")
-            for key in ("config", "seeds", "environment", "simulator")
-        ),
+        *((key, in_code(json.dumps(of, ensure_ascii=False)) if of else "none") for key, of in made.items()),
         ("packages", in_markdown(", ".join(packages))),
         ("commit", in_code(description["git_commit"]) if description["git_commit"] else "not recorded"),
         ("content hash (sha256)", f"`{description['content_hash']}`"),
