@@ -230,8 +230,8 @@ def validate(
     if report.faults:
         count = "1 error" if report.fault_count == 1 else f"{report.fault_count} errors"
         message = "\n  ".join([f"{root} has {count}:", *report.faults])
-        advice = f"If LeRobot's tools edited it: astra-data repair {root} --like ORIGINAL --out DIR\n"
-        advice += f"To recover its intact episodes: astra-data repair {root} --out DIR"
+        advice = f"If LeRobot's tools edited it: astra-data repair {quote(str(root))} --like ORIGINAL --out DIR\n"
+        advice += f"To recover its intact episodes: astra-data repair {quote(str(root))} --out DIR"
         raise CorruptDatasetError(f"{message}\n{advice}")
     typer.echo(f"{printable(str(root))} is intact: {report.episodes} episodes, {report.frames} steps")
     try:

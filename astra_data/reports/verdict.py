@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from operator import gt
 from pathlib import Path
+from shlex import quote
 from statistics import fmean
 from typing import Any
 
@@ -44,7 +45,7 @@ class Verdict:
             return None
         size = "" if self.percent is None else f" --percent {self.percent}"
         out = f"{Path(run).name}_{self.row}"
-        return f"astra-data deploy {run} --row {self.row} --seed {self.seed}{size} --out {out}"
+        return f"astra-data deploy {quote(str(run))} --row {self.row} --seed {self.seed}{size} --out {quote(out)}"
 
 
 def verdict_of(results: Results) -> Verdict:

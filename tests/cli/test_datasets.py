@@ -168,7 +168,7 @@ def called(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
 def test_validate_and_repair(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    root = write_fake(tmp_path / "set").root
+    root = write_fake(tmp_path / "a set").root
     assert called(monkeypatch, "validate", root) == 0
     told = capsys.readouterr().out
     assert told.startswith(f"{root} is intact: 5 episodes, 55 steps\nepisodes end: ")
@@ -177,8 +177,8 @@ def test_validate_and_repair(
     assert called(monkeypatch, "validate", root) == 1
     told = capsys.readouterr().err
     assert told.startswith(f"error: {root} has ") and "meta/tasks.parquet is missing" in told
-    assert "meta/stats.json was altered" in told and told.endswith(f"astra-data repair {root} --out DIR\n")
-    assert f"LeRobot's tools edited it: astra-data repair {root} --like ORIGINAL --out DIR\n" in told
+    assert "meta/stats.json was altered" in told and told.endswith(f"astra-data repair '{root}' --out DIR\n")
+    assert f"LeRobot's tools edited it: astra-data repair '{root}' --like ORIGINAL --out DIR\n" in told
     assert called(monkeypatch, "repair", root, "--out", tmp_path / "saved") == 0
     assert "finished: " in capsys.readouterr().out
     assert called(monkeypatch, "repair", root, "--out", tmp_path / "saved") == 1

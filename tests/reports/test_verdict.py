@@ -201,20 +201,19 @@ def test_a_run_ends_with_its_verdict_the_page_and_the_command_that_deploys(
 ) -> None:
     of = {"astra": (success,) * 3, "direct_transfer": (0.05,) * 3}
     found = results(of, of)
-    (tmp_path / "report").mkdir()
-    (tmp_path / "report/results.json").write_text(results_json(found))
-    page = tmp_path / "report/results.html"
-    page.touch()
-    show_made(tmp_path, None)
+    run = tmp_path / "a run"
+    (run / "report").mkdir(parents=True)
+    (run / "report/results.json").write_text(results_json(found))
+    (page := run / "report/results.html").touch()
+    show_made(run, None)
     first, verdict, best, floor, interval, *others = capsys.readouterr().out.splitlines()
-    assert first == f"finished: {tmp_path}" and re.match(rf"  best +ASTRA: success {success:.2f} \[", best)
+    assert first == f"finished: {run}" and re.match(rf"  best +ASTRA: success {success:.2f} \[", best)
     assert re.match(r"  floor +Direct transfer .*: success 0.05 \[", floor)
     assert re.match(rf"  interval +ASTRA less Direct transfer: {success - 0.05:.2f} \[", interval)
     assert all("select" not in line for line in (verdict, *others))
     if success > 0.5:
         assert verdict.startswith("Deploy ASTRA: ")
-        out = f"--out {tmp_path.name}_astra"
-        assert others == [str(page), f"astra-data deploy {tmp_path} --row astra --seed 0 {out}"]
+        assert others == [str(page), f"astra-data deploy '{run}' --row astra --seed 0 --out 'a run_astra'"]
     else:
         assert verdict == "Deploy none yet: ASTRA did not learn its own simulator (0.10)."
         assert "`total_steps` of `[train]`" in others[0] and others[-1] == str(page)
