@@ -118,7 +118,8 @@ def test_a_ball_is_at_two_indices_in_a_row(given: tuple[int, ...]) -> None:
     with pytest.raises(BadInputError, match=wanted + re.escape(str(given))):
         replace(ANT, quantities={"ball_position_m": given})
     kick = TASKS["nao-kick"]
-    assert kick.ball_rolls and not replace(kick, quantities={"ball_position_m": (4, 5)}).ball_rolls
+    others = ({"ball_position_m": (4, 5)}, {"ball_position_m": (4, 5), "ball_velocity_m_s": (5, 6)})
+    assert kick.ball_rolls and not any(replace(kick, quantities=each).ball_rolls for each in others)
     assert replace(ANT, quantities={"ball_position_m": (2, 3)}).ball_index == 2 and ANT.ball_index is None
 
 
