@@ -39,7 +39,7 @@ class PpoConfig(Config):
     total_steps: Count = 2_000_000
     """Maximum number of environment steps; a training whose episodes succeed ends earlier."""
     rollout_steps: Count = 64
-    """Steps of each environment per iteration."""
+    """Steps of each environment per iteration. A memory learns through as many as divide these, at most 16."""
     learning_rate: Positive = 5e-4
     """Learning rate at the start; decays linearly to zero."""
     discount: Share = 0.99
@@ -60,7 +60,7 @@ class Ppo(Learner):
         self._first_std = float(policy.log_std.detach().exp().max())
         self._optimizer = torch.optim.Adam(policy.parameters(), lr=config.learning_rate, eps=1e-5, fused=True)
         self._returns = ReturnScale(env.num_envs, config.discount).to(policy.log_std.device)
-        self._segment_steps = math.gcd(config.rollout_steps, _SEGMENT_STEPS)
+        self._segment_steps = max(n for n in range(1, _SEGMENT_STEPS + 1) if config.rollout_steps % n == 0)
         torch.manual_seed(derive(seed, "first reset"))
         super().__init__(
             env,

@@ -121,7 +121,7 @@ def test_an_update_is_that_of_the_printed_loss(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_a_segment_begins_with_the_memory_that_the_policy_acted_with(monkeypatch: pytest.MonkeyPatch) -> None:
-    learner = ppo(Recall(4), 1, horizon=5, memory=8, rollout_steps=24)
+    learner = ppo(Recall(4), 1, horizon=5, memory=8, rollout_steps=40)
     batches: list[dict[str, torch.Tensor]] = []
 
     def diverged(batch: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
@@ -131,7 +131,7 @@ def test_a_segment_begins_with_the_memory_that_the_policy_acted_with(monkeypatch
     monkeypatch.setattr(learner, "_loss", diverged)
     learner._learn(learner._collect())
     (batch,) = batches  # where learning stops
-    assert batch["action"].shape == (6, 8, 1)  # half of the three segments of four environments
+    assert batch["action"].shape == (8, 10, 1)  # half of the four segments of four environments
     assert batch["hidden"].abs().amax(1).gt(0.01).any()
     seen = (batch[name] for name in ("observation", "previous_action", "hidden", "start"))
     with torch.no_grad():
