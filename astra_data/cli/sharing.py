@@ -14,8 +14,7 @@ NotesPath = Annotated[Path | None, typer.Option(help="TOML file: license, summar
 def import_(
     recordings: Annotated[list[Path], typer.Argument(metavar="SOURCE", help="Files, folders, archives: one format.")],
     mapping: Annotated[
-        Path | None,
-        typer.Option(help="TOML file: which fields become which columns. D4RL, Minari and more need none."),
+        Path | None, typer.Option(help="TOML file: which fields become which columns. D4RL, Minari and more need none.")
     ] = None,
     file_format: Annotated[
         str | None,

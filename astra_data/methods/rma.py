@@ -119,8 +119,7 @@ class TeacherThenStudent(InSimulator):
         first = config.total_steps / (config.total_steps + settings.adaptation_steps)
         phase_1 = replace(training, progress=part(training.progress, 0.0, first))
         phase_2 = replace(training, progress=part(training.progress, first, 1.0))
-        ppo = Ppo(env, teacher, config, horizon=horizon, seed=seed)
-        curve = optimize(ppo, env, phase_1)
+        curve = optimize(Ppo(env, teacher, config, horizon=horizon, seed=seed), env, phase_1)
         adaptation = Adaptation(env, teacher, settings, rollout_steps=config.rollout_steps, horizon=horizon, seed=seed)
         curve["adaptation"] = optimize(adaptation, env, phase_2, f"adaptation_{CHECKPOINT}")
         for clock in CLOCKS:

@@ -151,8 +151,7 @@ class Ppo(Learner):
         gain = torch.minimum(ratio * advantage, clipped * advantage).mean()
         critic_loss = (policy.value(features) - target).square().mean()
         beyond = (output.abs() - 1.0).clamp_min(0.0).square().mean()
-        loss = VALUE_WEIGHT * critic_loss - gain + _PULL * beyond
-        return loss, -moved.mean()
+        return VALUE_WEIGHT * critic_loss - gain + _PULL * beyond, -moved.mean()
 
 
 def generalized_advantages(

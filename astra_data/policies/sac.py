@@ -129,8 +129,7 @@ class Sac(Learner):
 
     @without_gradients
     def _act(self) -> None:
-        names = ("observation", "previous_action", "hidden", "first")
-        seen = {name: getattr(self, name) for name in names}
+        seen = {name: getattr(self, name) for name in ("observation", "previous_action", "hidden", "first")}
         features, hidden = self.policy.remember(self.observation, self.previous_action, self.hidden)
         loc, scale = self.policy.policy(features)
         step, action, expired, _ = self.take(torch.tanh(torch.normal(loc, scale)), hidden)

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from astra_data.methods import grounded_as, method_role, method_title
+from astra_data.methods import grounded_as, method_named, method_role, method_title
 from astra_data.reports.blocks import listed
 from astra_data.reports.choice import Choice
 from astra_data.reports.results import SIMULATED, Results, judged_horizon
@@ -38,11 +38,14 @@ class Verdict:
     text: str
     lines: list[tuple[str, str]]
     remarks: list[str]
+    is_sensing: bool = False  # whether it acts on `[align] inputs`, which a deployed folder cannot
 
     def command(self, run: Path | str) -> str | None:
-        """Return the command that deploys the policy of the run at `run`; None where none is to be."""
+        """Return what deploys the policy of the run at `run`, a command or Python; None where none is to be."""
         if self.row is None:
             return None
+        if self.is_sensing:
+            return f"astra_data.load_policy({str(run)!r}, {self.row!r}, seed={self.seed}, percent={self.percent})"
         size = "" if self.percent is None else f" --percent {self.percent}"
         out = f"{Path(run).name}_{self.row}"
         return f"astra-data deploy {quote(str(run))} --row {self.row} --seed {self.seed}{size} --out {quote(out)}"
@@ -88,7 +91,9 @@ def verdict_of(results: Results) -> Verdict:
         chosen, why_it = first, ", the floor: no method does better" if is_beaten else f": {score}"
         text = f"{advice} **{method_title(first)}**{why_it}."
     remarks = [*causes, *_limits(results, worth, best)]
-    return Verdict(chosen, _seed(results, chosen) if chosen else 0, percent, text, lines, remarks)
+    align = results.settings.get("align")
+    is_sensing = bool(chosen and method_named(chosen).aligns and isinstance(align, dict) and align.get("inputs"))
+    return Verdict(chosen, _seed(results, chosen) if chosen else 0, percent, text, lines, remarks, is_sensing)
 
 
 def _judges(results: Results) -> Choice | None:

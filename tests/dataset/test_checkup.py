@@ -330,8 +330,7 @@ def test_a_rate_that_is_off_by_over_a_twentieth_is_wrong(period_s: float, found:
 def test_a_step_of_over_one_and_a_half_periods_is_a_gap(step_s: float, found: bool) -> None:
     timed = clock(REGULAR, [*REGULAR, step_s], REGULAR)
     assert timed.rates()[1] == found
-    findings = timed.findings("walks")
-    assert [finding.episodes for finding in findings] == [(1,)] * found
+    assert [finding.episodes for finding in timed.findings("walks")] == [(1,)] * found
 
 
 def test_gaps_are_counted_where_the_declared_rate_is_wrong_too() -> None:

@@ -162,8 +162,7 @@ def test_a_split_is_as_the_dataset_marks_it(tmp_path: Path) -> None:
     assert training.held_out is not None and not training.held_out.any()
     with pytest.raises(BadInputError, match="expected episodes to train on, got 2 that augmentation held out"):
         marked.select(torch.tensor([1, 3])).split(0.5, seed=0)
-    none = PairedEpisodes.load(write(tmp_path / "none", SIZES, held_out=()))
-    assert none.held_out is None
+    assert PairedEpisodes.load(write(tmp_path / "none", SIZES, held_out=())).held_out is None
 
 
 def test_copies_are_held_out_with_their_recording(tmp_path: Path) -> None:

@@ -187,9 +187,14 @@ def test_judges_choose_the_seed_and_without_a_target_the_method() -> None:
 
 @pytest.mark.parametrize(("percent", "sizes"), [(100, []), (100, [20, 100]), (20, [20])])
 def test_the_command_is_one_that_the_command_line_takes(percent: int, sizes: list[int], tmp_path: Path) -> None:
-    base = results({"astra": GOOD}, settings={"sweep": {"percent": sizes}})
-    lines = [line.model_copy(update={"percent": percent}) for line in base.lines]
-    command = verdict_of(base.model_copy(update={"lines": lines})).command(tmp_path / "cart")
+    settings, commands = {"sweep": {"percent": sizes}, "align": {"inputs": ["observation.imu"]}}, list[str | None]()
+    for row in ("nas", "astra"):  # which acts on these inputs
+        base = results({row: GOOD}, settings=settings)
+        lines = [line.model_copy(update={"percent": percent}) for line in base.lines]
+        commands.append(verdict_of(base.model_copy(update={"lines": lines})).command(tmp_path / "cart"))
+    command, python = commands
+    size, run = (percent if sizes else None), str(tmp_path / "cart")
+    assert python == f"astra_data.load_policy({run!r}, 'astra', seed=2, percent={size})"
     assert command is not None and (f"--percent {percent} " in command) == bool(sizes)
     done = CliRunner().invoke(app, command.split()[1:])
     assert done.exit_code == 1 and "No such option" not in done.output  # it is understood; there is no such run

@@ -45,10 +45,7 @@ ANT, WALKER, KICK = (TASKS[name] for name in ("antmaze-umaze", "humanoid-walker2
 
 def test_what_needs_a_maze_is_refused_where_there_is_none() -> None:
     assert ANT.maze is ANT.plane is U_MAZE
-    asked: list[Callable[[], object]] = [
-        lambda: WALKER.maze,
-        lambda: careful(WALKER, torch.zeros(1, 0)),
-    ]
+    asked: list[Callable[[], object]] = [lambda: WALKER.maze, lambda: careful(WALKER, torch.zeros(1, 0))]
     for ask in asked:
         with pytest.raises(BadInputError, match=r"a task in a maze, got 'humanoid-walker2d'.*leave out"):
             ask()

@@ -77,8 +77,7 @@ def report(
             _log.warning("%s: new results replace those of %s", path, "; ".join(changed))
     found = merge([*earlier, found]) if earlier else found
     progress(0.5, f"{len(found.tested())} methods, {len(found.seeds)} seeds")
-    scene = Scene(root, task, config.trajectory_methods, config.trajectory_episodes)
-    images = drawn(found, scene)
+    images = drawn(found, Scene(root, task, config.trajectory_methods, config.trajectory_episodes))
     progress(0.9, f"{len(images)} figures")
     sections = sections_of(found, f"runs/{root.name}" if root.is_absolute() else str(root))  # as commands name it
 
