@@ -150,26 +150,24 @@ class DatasetWriter:
             raise BadInputError(f"{self.root}: add episodes inside `with DatasetWriter(...) as writer:`.")
         self._admission.check(episode)
         length = len(episode)
-        pictures: dict[str, Any] = {}
-        for name, clip in episode.cameras.items() if self._cameras else ():
-            pictures |= {f"stats/{name}/{key}": value for key, value in clip.statistics.items()}
-            if name in self._clips:
-                try:
-                    span = self._clips[name].add(clip)
-                except CorruptDatasetError as error:
-                    advice = "`astra-data repair DATASET --out FOLDER` keeps the other episodes"
-                    raise CorruptDatasetError(f"{error}: {advice}") from None
+        pictures, held = dict[str, Any](), dict[str, pa.Array]()
+        try:
+            for name, clip in episode.cameras.items() if self._cameras else ():
+                pictures |= {f"stats/{name}/{key}": value for key, value in clip.statistics.items()}
+                if name not in self._clips:
+                    held[name] = pa.array(images(clip), layout.IMAGE)
+                    continue
+                span = self._clips[name].add(clip)
                 place = (*divmod(span.file, layout.CHUNK_SIZE), span.from_s, span.to_s)
                 pictures |= {f"videos/{name}/{key}": x for key, x in zip(layout.VIDEO_PLACE, place, strict=True)}
+        except CorruptDatasetError as error:
+            advice = "`astra-data repair DATASET --out FOLDER` keeps the other episodes"
+            raise CorruptDatasetError(f"{error}: {advice}") from None
         values = {name: episode.columns[name] for name in self._columns} | layout.reserved_values(
             length, uid=episode.uid, episode=len(self._lengths), start=self._frames, fps=self._fps
         )
         values[names.TIMESTAMP] = values[names.TIMESTAMP].astype(np.float32)
-        held = {name: to_arrow(np.array(column)) for name, column in values.items()} | {
-            name: pa.array(images(clip), layout.IMAGE)
-            for name, clip in episode.cameras.items()
-            if name in self._schema.names
-        }
+        held |= {name: to_arrow(np.array(column)) for name, column in values.items()}
         self._admission.keep(episode)
         if self._group_rows + length > self._most_rows:
             self._write_group()

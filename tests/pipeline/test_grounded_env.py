@@ -239,8 +239,7 @@ def test_a_policy_is_deployed_with_the_encoder_that_explains_the_latents(
     manifest = read_manifest(file.parent)
     assert manifest is not None
     write_manifest(file.parent, manifest.made_from)
-    loaded = load_policy(moved, "astra").target_encoder
-    assert (loaded is not None) == deployed
+    assert (load_policy(moved, "astra").target_encoder is not None) == deployed
 
 
 def test_a_policy_that_gives_no_actions_is_named(run: Path, tmp_path: Path) -> None:

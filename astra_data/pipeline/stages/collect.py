@@ -186,7 +186,10 @@ def suboptimal_by_ppo(
     world = ObservedTargetEnv(task, _PPO_ENVS, num_threads=num_threads)
     policy = ActorCritic(PolicyShape(world.observation_size, world.action_size))
     ppo = Ppo(world, policy, PpoConfig(total_steps=steps), horizon=task.objective.horizon, seed=seed)
-    judge: Judge = lambda figures: (ppo.steps / steps, f"reward per step {figures['reward']:.3f}")  # noqa: E731
+
+    def judge(figures: Mapping[str, float]) -> tuple[float, str]:
+        return ppo.steps / steps, f"reward per step {figures['reward']:.3f}"
+
     return _trained(ppo, world, judge, folder, progress, "abstract")
 
 
@@ -237,8 +240,7 @@ def _trained(
             logbook.keep({"learner": learner.state_dict(), "world": world.state_dict()})
     policy, config = learner.policy.requires_grad_(False), learner.config.model_dump(mode="json")
     settings = {"num_envs": learner.env.num_envs, "hidden_sizes": list(policy.shape.hidden_sizes), **config}
-    spent = logbook.stopwatch.spent()
-    metadata = {"trained_steps": learner.steps, "learner": settings, "spent": spent}
+    metadata = {"trained_steps": learner.steps, "learner": settings, "spent": logbook.stopwatch.spent()}
     return PolicyFile(policy, None, None, None, observed), metadata
 
 
