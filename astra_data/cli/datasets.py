@@ -286,7 +286,6 @@ def log(
         if not found.values:
             typer.echo("0 episodes differ in values")
         keys = ", ".join(f"{printable(key)} ({first_few(uids, 5)})" for key, uids in found.metadata.items())
-        different = set().union(*found.metadata.values())
-        typer.echo(f"{len(different)} episodes differ in metadata: {keys}")
+        typer.echo(f"{len(set().union(*found.metadata.values()))} episodes differ in metadata: {keys}")
     for sentence in (*found.schema, *found.description):
         typer.echo(printable(sentence))

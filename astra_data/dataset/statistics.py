@@ -42,8 +42,7 @@ def pooled(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     spread = values["std"] ** 2 + (values["mean"] - found["mean"]) ** 2
     found |= {"min": values["min"].min(axis=0), "max": values["max"].max(axis=0)}
     found |= {"std": np.sqrt((spread * count).sum(axis=0) / count.sum())}
-    counts = {"count": [int(values["count"].sum())]}
-    return {key: value.tolist() for key, value in found.items()} | counts
+    return {key: value.tolist() for key, value in found.items()} | {"count": [int(values["count"].sum())]}
 
 
 def side_by_side[C: (Column, PlainColumn)](columns: Iterable[C]) -> Iterator[tuple[C, slice]]:

@@ -49,8 +49,7 @@ class PolicyGraph(nn.Module):
         robot = replace(self._deployed)
         robot.resume(Memory(*hidden.split(list(self.parts.values()), dim=-1)))
         # Not `command`, whose checks depend on values and cannot be traced.
-        command = robot.task.limits.in_units(robot.act(state, goal))
-        return command, torch.cat(robot.memory, dim=-1)
+        return robot.task.limits.in_units(robot.act(state, goal)), torch.cat(robot.memory, dim=-1)
 
 
 def write_graph(deployed: RunningPolicy, folder: Path) -> tuple[dict[str, int], float]:

@@ -49,8 +49,7 @@ class Members(nn.Module):
         hidden = self.dropout(functional.elu(self.first(inputs.flatten(0, -2))))
         hidden = hidden.unflatten(-1, (self.count, -1)).transpose(0, 1)
         hidden = self.dropout(functional.elu(torch.baddbmm(self.second_bias, hidden, self.second_weight)))
-        odds = torch.baddbmm(self.last_bias, hidden, self.last_weight)
-        return odds.view(self.count, *inputs.shape[:-1])
+        return torch.baddbmm(self.last_bias, hidden, self.last_weight).view(self.count, *inputs.shape[:-1])
 
 
 class PositionFeatures(nn.Module):

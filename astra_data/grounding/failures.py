@@ -221,8 +221,7 @@ def fit_failures(
                 parameter.mul_(scale)
         model.log_odds_shift.copy_(shift)
     gains = [{"latent": bool(at), "nats_per_failure": fit and fit[0]} for at, (fit, *_) in enumerate(candidates)]
-    figures = {"latent": bool(model.shape.latent_size), "candidates": gains}
-    return model.requires_grad_(False).eval(), figures
+    return model.requires_grad_(False).eval(), {"latent": bool(model.shape.latent_size), "candidates": gains}
 
 
 def _cross_fitted(
@@ -298,8 +297,7 @@ def replayed_inputs(task: Task, grounding: Grounding, failures: FailureModel, ep
     moments = Moments.every(windows, RISK_STEPS)
     simulator = grounding.simulator(task, len(moments), str(windows.mask.device))
     hidden = grounding.hidden_before(windows, RISK_STEPS)
-    remembered = None if hidden is None else hidden[moments.episode, moments.first // RISK_STEPS]
-    moments.start(simulator, remembered)
+    moments.start(simulator, None if hidden is None else hidden[moments.episode, moments.first // RISK_STEPS])
     state = moments.state
     memory = failures.initial_memory(state, moments.previous_action)
     replayed = state.new_zeros(*windows.mask.shape, failures.shape.input_size)
@@ -322,8 +320,7 @@ def averages_before(task: Task, grounding: Grounding, failures: FailureModel, ep
     """Return the averages that a failure model remembers before each step, (E, T, 15), as in replays."""
     with seeded(0, episodes.windows.mask.device):
         seen = replayed_inputs(task, grounding, failures, episodes)
-    after = seen[..., _MAGNITUDES : _MAGNITUDES + _AVERAGES]
-    return functional.pad(after[:, :-1], (0, 0, 1, 0))
+    return functional.pad(seen[:, :-1, _MAGNITUDES : _MAGNITUDES + _AVERAGES], (0, 0, 1, 0))
 
 
 def failure_skill(probability: Tensor, episodes: PairedEpisodes) -> dict[str, Any]:

@@ -142,8 +142,7 @@ class GroundedSimulator(EpisodeSimulator):
         self.hidden = self.model.encoder.initial(count)
         self.goal = torch.zeros(count, shape.goal_size, device=device)
         self._last = self.latent, torch.zeros(count, shape.action_size, device=device)
-        memory_size = self.failures.memory_size if self.failures else 0
-        self._remembered = torch.zeros(count, memory_size, device=device)
+        self._remembered = torch.zeros(count, self.failures.memory_size if self.failures else 0, device=device)
 
     @property
     def blocked(self) -> Tensor:

@@ -128,8 +128,7 @@ class GroundingModel(nn.Module):
 
     def encode(self, windows: PairedWindows) -> tuple[Tensor, Tensor]:
         """Return the latents (B, T, Z) and memories (B, T, M) of histories that begin with `windows`."""
-        inputs = self.encoder_input(windows.state, windows.goal, windows.previous_action)
-        return self.encoder.sequence(inputs)
+        return self.encoder.sequence(self.encoder_input(windows.state, windows.goal, windows.previous_action))
 
     def predict_latent(self, latent: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """P_lat: return mean and log-variance (..., Z) of the next latent."""
@@ -195,8 +194,7 @@ class GroundingModel(nn.Module):
             following = self._following_latent(inputs)
             mean, log_variance = self.predict_latent(latent[:, :-1], action[:, :-1])
             nll = 0.5 * ((following - mean).square() / log_variance.exp() + log_variance).mean(-1)
-            both = mask[:, :-1] * mask[:, 1:]
-            parts["latent"] = _masked_mean(nll, both)
+            parts["latent"] = _masked_mean(nll, mask[:, :-1] * mask[:, 1:])
             total = total + weights.latent * parts["latent"]
         if weights.reward > 0:
             # The reward itself shapes the latent (paper, L_rew); the residual is what policies are paid.

@@ -21,7 +21,7 @@ from astra_data.core.durable import begun_beside
 from astra_data.core.errors import AstraDataError, BadInputError, RecipeError
 from astra_data.core.naming import base_method, first_few, shortened, stage_of_key
 from astra_data.dataset.columns import ABSTRACT_STATE, ACTION
-from astra_data.dataset.description import changed_values, read_description
+from astra_data.dataset.description import changed_values, full_name, identity_of, read_description
 from astra_data.dataset.edit import share
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import lineage, open_dataset
@@ -347,8 +347,12 @@ def _digest(key: str, experiment: Experiment) -> str | None:
     return None
 
 
-def data_condition(recipe: Recipe) -> Condition | None:
-    """Return the condition of a recipe's `data`, which fit its task; None if it has none, or has yet to pull it."""
+def data_condition(experiment: Experiment) -> Condition | None:
+    """Return the condition of a recipe's `data`, which fit its task; None if it has none, or has yet to pull it.
+
+    Data that have a new version are refused as long as seeds are left to begin with them.
+    """
+    recipe = experiment.recipe
     if recipe.data is None or is_address(recipe.data):
         return None
     try:
@@ -358,6 +362,15 @@ def data_condition(recipe: Recipe) -> Condition | None:
     if ABSTRACT_STATE in source.features:
         advice = "name the dataset that this one was made from (see `astra-data log`)"
         raise BadInputError(f"data: {source.reference} is paired already, but a recipe pairs its data itself: {advice}")
+    labels, others = [item for item in experiment.items.values() if item.stage == "label"], dict[str, str]()
+    for key in (item.key for item in labels if condition(item, experiment).state == "finished"):
+        made = read_description(place := experiment.place(key))
+        used = identity_of(made) if place.is_symlink() else next(iter(made["parents"]), identity_of(made))
+        others |= {key: full_name(used)} if used["hash"] != source.content_hash else {}
+    if others and len(others) < len(labels):
+        before = " and ".join(dict.fromkeys(others.values()))
+        advice = f"name {before} as data, or remove {' '.join(str(experiment.folder / key) for key in others)}"
+        raise BadInputError(f"data: {source.reference} is not {before}, which other seeds were made from: {advice}")
     task = task_named(recipe.task)
     check_fits(source, task)
     source.specs(recipe.align.inputs)

@@ -160,7 +160,7 @@ def check(recipe_path: Path, *, root: Path = RUNS, verify: bool = False) -> dict
     if not is_shipped(experiment.recipe.task):
         _check_task(experiment)
     recorded_code(experiment.folder)  # refused where it is damaged
-    data = data_condition(experiment.recipe)
+    data = data_condition(experiment)
     found = {key: condition(item, experiment, verify=verify) for key, item in experiment.items.items()}
     return found if data is None else {"data": data, **found}
 
@@ -216,7 +216,7 @@ def make(
                 advice = "restore it from a copy, recover its intact episodes with `astra-data repair`, or remove it"
                 raise BadInputError(f"{folder / key} is {again[key]}, and was not made by this recipe: {advice}")
         items = [one for one in items if one.key in again or one.stage in ALWAYS_NEW or not experiment.has(one.key)]
-        data = data_condition(recipe) if any(item.stage == "label" for item in items) else None
+        data = data_condition(experiment) if any(item.stage == "label" for item in items) else None
         _check_inputs(experiment, items, planned)
         experiment.link_borrowed()
         console = Console()

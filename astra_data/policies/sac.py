@@ -171,8 +171,7 @@ class Sac(Learner):
         if self._recorded is not None:
             size = actor_loss.detach().abs()  # for the most part action values
             actor_loss = actor_loss + _IMITATION_WEIGHT * size * self._distance(self._recorded)
-        surplus = action.shape[-1] - log_prob.detach().mean()
-        return critic_loss, actor_loss, self._log_temperature * surplus
+        return critic_loss, actor_loss, self._log_temperature * (action.shape[-1] - log_prob.detach().mean())
 
     def _distance(self, recorded: "Recorded") -> Tensor:
         """Return the mean squared distance of the policy's actions, without exploration, from recorded ones."""

@@ -32,8 +32,7 @@ def test_a_dataset_is_collected_and_paired_without_a_recipe(home: Path) -> None:
     assert (len(dataset), dataset.lengths.tolist()) == (2, [3, 3])
     paired = call("pair", "antmaze-umaze-random-seed3", "--simulator", "antmaze-umaze")
     assert paired.output.splitlines()[-1] == f"finished: {folder.with_name('data-2.0.0')}"
-    newest = open_dataset("antmaze-umaze-random-seed3")
-    assert newest.description["parents"] == [dataset.identity]
+    assert open_dataset("antmaze-umaze-random-seed3").description["parents"] == [dataset.identity]
 
 
 def test_an_option_of_0_is_given(home: Path) -> None:

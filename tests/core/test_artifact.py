@@ -149,8 +149,7 @@ def test_the_disk_has_what_a_folder_holds_before_its_name(tmp_path: Path, disk_o
     with finished_folder(tmp_path / "out") as folder:
         (folder / "model").write_text("weights")
         disk_order.clear()
-    before = disk_order[: disk_order.index("replace")]
-    assert sorted(before) == ["fsync .out.partial", "fsync model"]
+    assert sorted(disk_order[: disk_order.index("replace")]) == ["fsync .out.partial", "fsync model"]
 
 
 def test_a_manifest_holds_sizes_and_sums_by_which_damage_is_found(tmp_path: Path) -> None:

@@ -186,8 +186,7 @@ def test_altered_pictures_are_refused_and_cost_their_episode_alone(
     with pytest.raises(CorruptDatasetError, match=re.escape(fault + advice)):
         subset(opened, percent=100, out=tmp_path / "all")
     assert not (tmp_path / "all").exists()
-    notes = repair(root, out=tmp_path / "repaired").notes
-    assert f"left out the episode of uid 3: {fault}" in notes
+    assert f"left out the episode of uid 3: {fault}" in repair(root, out=tmp_path / "repaired").notes
     assert_shows(tmp_path / "repaired", source, {uid: ALL[uid] for uid in (8, 5)})
 
 

@@ -105,8 +105,7 @@ def test_scatter_sets_no_ball_rolling() -> None:
     simulator = HistoryGrounding(model, scatter_model=scatter).simulator(task, 500)
     state = torch.tensor([0.0, 0.0, 0.0, 0.0, 0.3, 0.0, 0.0, 0.0]).expand(500, 8)
     simulator.start(state, torch.arange(500), torch.zeros(500, 2))
-    after = simulator.step(torch.tensor([0.0, 0.0, 1.0]).expand(500, 3))
-    assert torch.equal(after[:, 4:], state[:, 4:])
+    assert torch.equal(simulator.step(torch.tensor([0.0, 0.0, 1.0]).expand(500, 3))[:, 4:], state[:, 4:])
 
 
 CONTACT_M, PUSHED_M = 0.06, 0.02

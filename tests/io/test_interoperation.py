@@ -92,8 +92,7 @@ def test_our_metadata_is_joined_again_after_lerobot_deleted_episodes(runs: Runs,
     assert_succeeded(runs, "delete")
     edited = runs.folder / "deleted"
     assert check(edited).faults == []
-    result = repair(edited, out=tmp_path / "set", like=runs.dataset)
-    assert result.episodes == 3
+    assert repair(edited, out=tmp_path / "set", like=runs.dataset).episodes == 3
     joined = Dataset.open(tmp_path / "set")
     assert joined.verify() == []
     kept = [episode for number, episode in enumerate(runs.dataset.episodes()) if number not in (1, 3)]

@@ -42,8 +42,7 @@ def test_the_example_is_a_mapping_and_shows_every_key() -> None:
     path = Path(__file__).parents[2] / "recipes/imports/example.toml"
     load_recipe(path, ImportMapping)
     keys = {key for model in (ImportMapping, ColumnMapping, Split, Jump) for key in model.model_fields}
-    words = set(re.findall(r"\w+", path.read_text()))
-    assert keys - words == set()
+    assert keys - set(re.findall(r"\w+", path.read_text())) == set()
 
 
 @pytest.mark.parametrize("recipe", ["quickstart", "nao_real"])

@@ -14,8 +14,7 @@ ROWS = {
 
 
 def test_the_rows_of_the_ablation_differ_by_one_part_each() -> None:
-    rows = [name for name in METHODS if name.startswith("astra")]
-    assert rows == [*ROWS]
+    assert [name for name in METHODS if name.startswith("astra")] == [*ROWS]
     for name, (aligns, pays, differences) in ROWS.items():
         method = METHODS[name]
         assert isinstance(method.fit, HistoryFit) and isinstance(method.learn, InSimulator)

@@ -87,8 +87,7 @@ def mean_action(policy: Policy) -> Tensor:
 
 def test_it_finds_the_way_where_imitation_does_not() -> None:
     experience = walks()
-    found = trained(learner(experience, QUICK, memory=8))
-    assert mean_action(found.policy).min() > 0.3
+    assert mean_action(trained(learner(experience, QUICK, memory=8)).policy).min() > 0.3
     imitated = trained(learner(experience, config(temperature=0.0, critic_updates=1), memory=8))
     assert mean_action(imitated.policy).abs().max() < 0.2
 

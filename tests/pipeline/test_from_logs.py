@@ -11,13 +11,14 @@ import pytest
 import torch
 from quick_runs import small_tables
 
+from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import GOAL, REWARD
 from astra_data.dataset.edit import filter_episodes, subset
 from astra_data.dataset.reader import Dataset
 from astra_data.io.importing import import_dataset
 from astra_data.pipeline.experiment import condition, load_experiment
 from astra_data.pipeline.plan import plan
-from astra_data.pipeline.run import check, set_aside
+from astra_data.pipeline.run import check, run, set_aside
 from astra_data.pipeline.stages.label import label
 from astra_data.pipeline.trained_policy import load_policy
 from astra_data.reports.artifacts import EVALUATION, Evaluation, read_json
@@ -125,3 +126,26 @@ def test_other_data_of_the_same_name_are_labeled_anew(cart: Path, tmp_path: Path
     link.unlink()
     link.symlink_to(label(experiment.recipe.task, data=tmp_path / "others", out=tmp_path / "labeled"))
     assert condition(item, experiment).why.startswith("made from another dataset than cart-logs@")
+
+
+@pytest.mark.usefixtures("home")
+@pytest.mark.parametrize("lacks_nothing", [False, True])
+def test_all_seeds_begin_with_one_version_of_the_data(lacks_nothing: bool, cart: Path, tmp_path: Path) -> None:
+    shutil.copy(cart / "cart.py", tmp_path / "cart.py")
+    logs = import_dataset(sorted((cart / "csv").glob("*.csv")), CART / "logs.toml", name="drives").root
+    logs = label(f"{tmp_path / 'cart.py'}:TASK", data=logs) if lacks_nothing else logs
+    shutil.copytree(logs, tmp_path / "logs")
+    folder, _ = made(tmp_path, "one", 'methods = ["nas"]\n', lambda key: key.startswith("label"))
+    before = Dataset.open(logs)
+    now = Dataset.open(filter_episodes(before, without=before.uids[:1].tolist()))
+    path = tmp_path / "one.toml"
+    path.write_text(path.read_text().replace('data = "logs"', 'data = "drives"'))
+    assert check(path, root=tmp_path / "runs")["label/seed_0"].state == "finished"  # as all are
+    path.write_text(path.read_text().replace("seeds = [0]", "seeds = [0, 1]"))
+    fault = f"data: {now.reference} is not {before.reference}, which other seeds were made from: name "
+    fault += f"{before.reference} as data, or remove {folder / 'label/seed_0'}"
+    for command in (check, run):
+        with pytest.raises(BadInputError, match=f"^{re.escape(fault)}$"):
+            command(path, root=tmp_path / "runs")
+    path.write_text(path.read_text().replace('"drives"', f'"{before.reference}"'))
+    assert [of.state for of in check(path, root=tmp_path / "runs").values()][1:3] == ["finished", "missing"]

@@ -104,8 +104,7 @@ def test_who_steps_the_target_gets_threads_and_networks_a_device(tmp_path: Path)
     threaded = {item.key.removesuffix("/seed_0") for item in items if item.is_threaded and "seed_0" in item.key}
     rows = ("follower", "direct_transfer", "astra", "target")
     assert threaded == {"collect", "train/target", *(f"evaluate/{row}" for row in rows)}
-    on_device = {item.stage for item in items if item.device == "cuda"}
-    assert on_device == {"ground", "train", "align"}
+    assert {item.stage for item in items if item.device == "cuda"} == {"ground", "train", "align"}
     settings = {item.key: item.call.keywords.get("settings") for item in items}  # type: ignore[attr-defined]
     assert settings["train/target/seed_0"] is not None and settings["train/astra/seed_0"] is None
     recorded = {item.key: item.call.keywords.get("recorded") for item in items}  # type: ignore[attr-defined]

@@ -75,8 +75,7 @@ def test_what_is_written_is_read_again(tmp_path: Path) -> None:
     found = results(line("astra", 0, success=0.5), errors=[error("nas", 0, "raw", 1.0, 2.0)], trainings=[training])
     path = tmp_path / "r.json"
     path.write_text(results_json(found))
-    again = read_results(path)
-    assert again.model_dump_json() == found.model_dump_json()
+    assert read_results(path).model_dump_json() == found.model_dump_json()
     assert json.loads(path.read_text())["trainings"][0]["score"] == [None, 0.5]
     assert '    {"row": "astra", "seed": 0, "percent": 100, "where": "tested"' in path.read_text()
     path.write_text("{}")

@@ -211,8 +211,7 @@ def rebuilt_metadata(path: Path, schema: pa.Schema) -> pq.FileMetaData:
     row = pa.table([pa.nulls(1, field.type) for field in schema], schema=schema)
     pq.write_table(row, template, compression="snappy")
     footer = _footer(template.getvalue(), groups, leaves)
-    file = b"PAR1" + footer + len(footer).to_bytes(4, "little") + b"PAR1"
-    return pq.read_metadata(pa.BufferReader(file))
+    return pq.read_metadata(pa.BufferReader(b"PAR1" + footer + len(footer).to_bytes(4, "little") + b"PAR1"))
 
 
 def _pages(path: Path) -> Iterator[_Page]:

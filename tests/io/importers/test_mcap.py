@@ -133,8 +133,7 @@ def test_a_pause_of_all_topics_ends_the_episode_with_its_last_message(
     drives = [m for t in (0.0, 60.0) for k in range(5) for m in (pose(t + k / 10, k), command(t + k / 10, k))]
     dataset, report = imported(tmp_path, write_json(tmp_path / "log.mcap", drives), MAPPING)
     assert dataset.lengths.tolist() == [4, 4] and report.tally.rows == 10
-    turns = dataset.columns([ACTION])[ACTION].tolist()
-    assert turns == [0.0, 1.0, 2.0, 3.0] * 2 and not caplog.messages
+    assert dataset.columns([ACTION])[ACTION].tolist() == [0.0, 1.0, 2.0, 3.0] * 2 and not caplog.messages
 
 
 def test_a_topic_that_alone_is_silent_is_named_with_the_remedy(

@@ -318,8 +318,7 @@ def test_balls_are_moved_with_their_robots(tmp_path: Path) -> None:
         apart, before = (path[:, 4:6] - path[:, :2] for path in paths)
         np.testing.assert_allclose(np.linalg.norm(apart, axis=1), np.linalg.norm(before, axis=1), atol=1e-5)
         assert np.abs(apart - before).max() > 0.01
-    paired = pair("nao-kick", dataset=folder, out=tmp_path / "paired")
-    assert len(PairedEpisodes.load(paired)) == 9
+    assert len(PairedEpisodes.load(pair("nao-kick", dataset=folder, out=tmp_path / "paired"))) == 9
 
 
 def test_grounding_holds_out_what_was_not_copied(augmented: Path, tmp_path: Path) -> None:

@@ -232,8 +232,7 @@ def test_sizes_are_set_side_by_side(rough: None, tmp_path: Path, monkeypatch: py
     edit_json(path, target=outcomes([0, 0, 0, 0], 2))
     asked = {"seeds": [*SEEDS, 7], "sweep": {"percent": [10, 100, 50]}}
     sized = FakeRecipe(name="sizes", methods=("direct_transfer", "astra"), percents=(10, 100, 50), settings=asked)
-    found = make(root, tmp_path / "results", sized)
-    assert found.percents == [50, 100]
+    assert make(root, tmp_path / "results", sized).percents == [50, 100]
     html = read_page((root / "report/results.html").read_text())
     head, direct, astra = html.table("Success in the target, mean")
     assert (head, astra) == (["method", "50 %", "100 %"], ["ASTRA", "0.25 ± 0.25", "0.50 ± 0.25"])

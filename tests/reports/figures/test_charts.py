@@ -65,8 +65,7 @@ def test_curves_have_a_panel_per_method_and_a_band_from_worst_to_best(scene: Sce
     figure = drawn(learning_curves(found, scene))
     axes = next(axes for axes in figure.axes if axes.get_title(loc="left"))
     assert axes.get_title(loc="left") == "ASTRA" and [of.get_linestyle() for of in axes.lines] == ["-", "--"]
-    mean = np.asarray(axes.lines[0].get_ydata())
-    assert mean[[0, -1]] == pytest.approx([0.1, 0.7])
+    assert np.asarray(axes.lines[0].get_ydata())[[0, -1]] == pytest.approx([0.1, 0.7])
     band = np.asarray(axes.collections[0].get_paths()[0].vertices)[:, 1]
     assert (band.min(), band.max()) == pytest.approx((0.0, 1.0))
     assert figure.get_supylabel() == f"{SUCCESS.title} of training\nepisodes, from all starts"

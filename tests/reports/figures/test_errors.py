@@ -100,5 +100,4 @@ def test_validity_draws_a_dot_per_policy_in_its_methods_color() -> None:
     assert [line.get_color() for line in (nas, astra)] == [method_color("nas"), method_color("astra_plus")]
     assert nas.get_marker() != astra.get_marker() and len(grounded.lines) == 2
     assert png(figure).startswith(b"\x89PNG")
-    nowhere = found.model_copy(update={"tested_in": "simulators"})
-    assert predictive_validity(nowhere, SCENE) is None
+    assert predictive_validity(found.model_copy(update={"tested_in": "simulators"}), SCENE) is None

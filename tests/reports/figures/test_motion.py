@@ -74,8 +74,7 @@ def test_trajectories_draw_a_panel_per_method_with_crosses_where_episodes_fail(s
     assert trajectories(results("astra", "follower"), scene) is None  # where a method has none, there is no figure
     write(scene.root, "follower", simulated=False)
     figure = drawn(trajectories(results("astra", "follower"), scene))
-    told = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert told[1] == "in the target"
+    assert [text.get_text() for text in figure.legends[0].get_texts()][1] == "in the target"
     astra, follower = figure.axes
     assert (astra.get_title(loc="left"), astra.get_title(loc="right")) == ("ASTRA", "0.33")
     assert follower.get_title(loc="left") == "Careful follower"
@@ -109,8 +108,7 @@ def test_without_a_maze_paths_are_drawn_where_they_lead(scene: Scene) -> None:
     write(scene.root, "iql", goal=np.zeros((3, 0)), positions=(2, 0))  # a target that walks, of joints in a simulator
     (iql,) = drawn(trajectories(results("iql"), humanoid)).axes
     assert [line.get_color() for line in iql.lines if line.get_linestyle() != "None"] == [DEPLOYED] * 3
-    state = torch.tensor([[0.5, -0.25, 1.0, 0.0]])
-    assert cart.task.objective.places(state).tolist() == [[0.5, -0.25]]
+    assert cart.task.objective.places(torch.tensor([[0.5, -0.25, 1.0, 0.0]])).tolist() == [[0.5, -0.25]]
 
 
 def test_a_star_stands_at_the_mean_goal_of_each_cell_and_a_ball_has_a_path_of_its_own(scene: Scene) -> None:

@@ -35,8 +35,7 @@ def test_every_row_has_its_own_color_and_a_plus_row_its_base_rows_darker() -> No
 def test_drawing_leaves_the_callers_settings_alone_and_needs_no_display(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
     before = dict(matplotlib.rcParams)
-    image = png(bars("nas"))
-    assert image.startswith(b"\x89PNG") and dict(matplotlib.rcParams) == before
+    assert png(bars("nas")).startswith(b"\x89PNG") and dict(matplotlib.rcParams) == before
 
 
 def test_a_palette_keeps_the_colors_of_methods() -> None:

@@ -177,8 +177,7 @@ def test_joints_approach_their_targets(kind: Kind, friction: float, scale: float
         left = math.exp(-rate * 7 * scale * 0.015)
         assert float(landed[joint]) == pytest.approx(target * (1 - left), abs=1e-5)
         assert float(landed[17 + joint]) == pytest.approx(target * rate * left, abs=1e-4)
-    others = [joint for joint in range(17) if joint not in humanoid.COMMANDED]
-    assert not landed[others].any()
+    assert not landed[[joint for joint in range(17) if joint not in humanoid.COMMANDED]].any()
 
 
 def test_walkers_have_the_damping_and_the_time_that_they_were_given() -> None:

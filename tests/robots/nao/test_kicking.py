@@ -88,8 +88,7 @@ def test_it_stands_and_kicks() -> None:
 def test_parameters_do_what_their_names_say(variation: BallVariation, entry: int, expected: float) -> None:
     simulator = VariedPlanar(one(), variation)
     simulator.reset_to(torch.tensor([[0.0, 0.0, 0.0, 0.0, 0.2, 0.0, 0.0, 0.0]]))
-    state = simulator.step(AHEAD)
-    assert state[0, entry].item() == pytest.approx(expected, abs=1e-5)
+    assert simulator.step(AHEAD)[0, entry].item() == pytest.approx(expected, abs=1e-5)
 
 
 def test_a_correction_moves_no_ball_that_lies_untouched() -> None:
