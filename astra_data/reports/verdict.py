@@ -92,7 +92,7 @@ def verdict_of(results: Results) -> Verdict:
         text = f"{advice} **{method_title(first)}**{why_it}."
     remarks = [*causes, *_limits(results, worth, best)]
     align = results.settings.get("align")
-    is_sensing = bool(chosen and method_named(chosen).aligns and isinstance(align, dict) and align.get("inputs"))
+    is_sensing = bool(chosen and isinstance(align, dict) and align.get("inputs") and method_named(chosen).aligns)
     return Verdict(chosen, _seed(results, chosen) if chosen else 0, percent, text, lines, remarks, is_sensing)
 
 
