@@ -348,10 +348,7 @@ def _digest(key: str, experiment: Experiment) -> str | None:
 
 
 def data_condition(experiment: Experiment) -> Condition | None:
-    """Return the condition of a recipe's `data`, which fit its task; None if it has none, or has yet to pull it.
-
-    Data that have a new version are refused as long as seeds are left to begin with them.
-    """
+    """Return the condition of `data`, which fit task and finished seeds; None without any, or if yet to be pulled."""
     recipe = experiment.recipe
     if recipe.data is None or is_address(recipe.data):
         return None
@@ -366,7 +363,8 @@ def data_condition(experiment: Experiment) -> Condition | None:
     for key in (item.key for item in labels if condition(item, experiment).state == "finished"):
         made = read_description(place := experiment.place(key))
         used = identity_of(made) if place.is_symlink() else next(iter(made["parents"]), identity_of(made))
-        others |= {key: full_name(used)} if used["hash"] != source.content_hash else {}
+        if used["hash"] != source.content_hash:
+            others[key] = full_name(used)
     if others and len(others) < len(labels):
         before = " and ".join(dict.fromkeys(others.values()))
         advice = f"name {before} as data, or remove {' '.join(str(experiment.folder / key) for key in others)}"

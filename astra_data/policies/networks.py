@@ -306,7 +306,8 @@ class ReturnScale(nn.Module):
         self.var = (spread + apart.square() * self.count * count / total) / total
         self.mean, self.count = self.mean + apart * count / total, total
         self.sums = torch.where(done, 0.0, self.sums)
-        return torch.clamp(reward / (self.var + 1e-8).sqrt().float(), -_LARGEST_REWARD, _LARGEST_REWARD)
+        deviation = (self.var + 1e-8).sqrt().float()
+        return torch.clamp(reward / deviation, -_LARGEST_REWARD, _LARGEST_REWARD)
 
 
 class UserPolicy(Policy):

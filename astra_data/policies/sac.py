@@ -171,7 +171,8 @@ class Sac(Learner):
         if self._recorded is not None:
             size = actor_loss.detach().abs()  # for the most part action values
             actor_loss = actor_loss + _IMITATION_WEIGHT * size * self._distance(self._recorded)
-        return critic_loss, actor_loss, self._log_temperature * (action.shape[-1] - log_prob.detach().mean())
+        surplus = action.shape[-1] - log_prob.detach().mean()
+        return critic_loss, actor_loss, self._log_temperature * surplus
 
     def _distance(self, recorded: "Recorded") -> Tensor:
         """Return the mean squared distance of the policy's actions, without exploration, from recorded ones."""

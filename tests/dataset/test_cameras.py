@@ -164,12 +164,12 @@ def test_frames_are_cut_within_groups_and_encoded_again_in_long_ones(codec: str,
 @pytest.mark.parametrize(
     ("folder", "camera", "told"),
     [
-        ("videos", FRONT, "{0} was altered after it was written"),
-        ("data", TOP, "{0.parent.name}/{0.name} cannot be read (could not verify page integrity"),
+        ("videos", FRONT, ("{0} was altered after it was written", "")),
+        ("data", TOP, ("{0.parent.name}/{0.name} cannot be read", " (could not verify page integrity")),
     ],
 )
 def test_altered_pictures_are_refused_and_cost_their_episode_alone(
-    source: Dataset, tmp_path: Path, folder: str, camera: str, told: str
+    source: Dataset, tmp_path: Path, folder: str, camera: str, told: tuple[str, str]
 ) -> None:
     root = shutil.copytree(source.root, tmp_path / "damaged")
     file = min(path for path in (root / folder).rglob("*") if path.is_file())
@@ -178,7 +178,7 @@ def test_altered_pictures_are_refused_and_cost_their_episode_alone(
     content[pictures[len(pictures) // 2] if camera == TOP else len(content) // 2] ^= 255
     file.write_bytes(content)
     [fault], [of_episode], opened = Dataset.open(root).verify(), check(root).faults, Dataset.open(root)
-    assert fault.startswith(told.format(file))
+    assert fault.split(" (could")[0] == told[0].format(file) and fault.startswith(told[0].format(file) + told[1])
     assert of_episode == f"{camera} in episode 0: {fault}"
     with pytest.raises(CorruptDatasetError, match=re.escape(fault)):
         opened.require_whole()
